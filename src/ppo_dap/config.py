@@ -1,0 +1,270 @@
+"""Every setting of a run, as frozen dataclasses: the paper's Table 2, the PPO recipe, and what both leave open.
+
+Field names are unique over all groups, so one flat name (`lambda_kl`, on the command line `--lambda-kl`) finds its field;
+`replace` does that. `PRESETS` holds the two settings that every result is quoted with: `paper` is Table 2 to the letter,
+`tuned` is the best that our own studies found (docs/results.md says on which seeds).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from ppo_dap.errors import InputError, unknown
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """The one PPO recipe, the same for every method."""
+
+    num_envs: int = 8
+    """Environments stepped side by side."""
+    rollout_steps: int = 2048
+    """Environment steps of one iteration, over all environments (size of D_on)."""
+    minibatch_size: int = 256
+    """Rows of one actor update (Table 2: batch size)."""
+    num_epochs: int = 10
+    """Passes over D_on in one iteration."""
+    learning_rate: float = 3e-4
+    """Adam's rate at the start; decays linearly to 0 over the run."""
+    gamma: float = 0.99
+    """Discount (Eq. 1)."""
+    gae_lambda: float = 0.95
+    """GAE's lambda (Table 2)."""
+    clip_epsilon: float = 0.2
+    """Clip range of the importance ratio (Eq. 5, Table 2)."""
+    value_coefficient: float = 0.5
+    """Weight of the value loss."""
+    max_grad_norm: float = 0.5
+    """Global gradient norm at which the actor's and the critic's gradients are clipped, each on its own."""
+    kl_rule: Literal["stop_epochs", "reduce_lr", "monitor"] = "stop_epochs"
+    """What happens when the policy-KL of an epoch exceeds `kl_target`: skip the iteration's remaining epochs, halve
+    the learning rate from the next iteration on (until the KL falls below half the target), or only log it."""
+    kl_target: float = 0.02
+    """Policy-KL monitoring target (Table 2)."""
+    hidden_size: int = 64
+    """Width of the two tanh layers of actor and critic."""
+    observation_clip: float = 10.0
+    """Normalised observations are clipped to this many standard deviations."""
+    reward_clip: float = 10.0
+    """Scaled rewards are clipped to this absolute value."""
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """Value-guided proposals (4.3) and the Gaussian proxy (Eq. 10)."""
+
+    num_proposals: int = 10
+    """K: candidate actions a state (Table 2)."""
+    sampler: Literal["ancestral", "dpmpp_2m"] = "ancestral"
+    """Denoising solver: the stochastic one of Eq. 8, or DPM-Solver++ 2M, which needs half the steps (4.7)."""
+    sampler_steps: int = 20
+    """N_steps: denoising steps (Table 2)."""
+    proposal_fraction: float = 0.2
+    """Share of D_on's states that get proposals, drawn anew in each iteration; 1 is Algorithm 1 to the letter."""
+    guidance: Literal["none", "energy", "gradient", "energy+gradient"] = "energy+gradient"
+    """Value guidance: energy weights (Eq. 7), gradient inside the denoising (Eq. 8), both, or none."""
+    beta_max: float = 1.0
+    """Energy temperature after annealing (Eq. 7)."""
+    beta_anneal: float = 0.3
+    """Fraction of the iterations over which beta rises linearly from 0."""
+    alpha_max: float = 0.3
+    """Gradient guidance at zero noise (Eq. 8)."""
+    guidance_cap: float = 0.1
+    """c: largest norm of one guidance step (4.3)."""
+    cap_on: Literal["step", "gradient"] = "step"
+    """What the cap bounds: alpha_t * grad Q (4.3), or grad Q before alpha_t (Table 2, 5.5)."""
+    displacement_cap: float | None = None
+    """Largest norm of all guidance steps of one proposal together, in scaled actions; None: no such bound."""
+    q_scale: Literal["running", "none"] = "running"
+    """Eq. 7 sees Q less the state's mean over one running global scale, or Q as printed."""
+    top_k: int | None = None
+    """Keep only the k proposals of a state with the highest Q before weighting (4.3); None keeps all."""
+    proxy_std_floor: float = 0.1
+    """Smallest standard deviation of the Gaussian proxy (Eq. 10), in scaled actions."""
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Weights of the actor objective (Eq. 9)."""
+
+    lambda_kl: float = 5e-3
+    """Weight of KL(pi || proxy) (Table 2)."""
+    lambda_aux: float = 1e-2
+    """Weight of the imitation of proposals (Table 2)."""
+    lambda_decay: float | None = None
+    """Fraction of the run at which both weights have decayed linearly to 0; None keeps them constant."""
+
+
+@dataclass(frozen=True)
+class QConfig:
+    """The action-value head that guides proposals; it never touches PPO."""
+
+    q_trunk: Literal["stop_gradient", "shared", "separate"] = "stop_gradient"
+    """Features Q reads: the value trunk's with the gradient stopped, the same with its gradient let in (the audit
+    reports it), or a trunk of its own."""
+    q_hidden_size: int = 64
+    """Width of Q's hidden layer."""
+    q_learning_rate: float = 1e-3
+    """Adam's rate for Q."""
+    q_epochs: int = 2
+    """Passes over D_on a Q update makes in each iteration."""
+
+
+@dataclass(frozen=True)
+class AdaptationConfig:
+    """Parameter-efficient tuning of the prior on D_on (4.2, PET)."""
+
+    pet_frequency: int = 10
+    """f: PET steps per 100 actor updates (minibatch steps); 0 is No-PET (Table 2)."""
+    pet_learning_rate: float = 1e-5
+    """Adam's rate for the adapters (Table 2)."""
+    pet_minibatch_size: int = 256
+    """Rows of one PET step, all from D_on."""
+    adapter: Literal["lora", "bottleneck"] = "lora"
+    """Kind of adapter; both start as an exact identity."""
+    adapter_rank: int = 8
+    """r: rank of LoRA, width of the bottleneck (Table 2)."""
+
+
+@dataclass(frozen=True)
+class WarmStartConfig:
+    """Supervised start of the networks from logs (3.4, optional)."""
+
+    warm_start: Literal["none", "actor", "actor_critic"] = "none"
+    """What logs initialise: nothing, the actor (maximum likelihood) and the normaliser, or also V and Q (logged
+    returns-to-go)."""
+    warm_start_epochs: int = 20
+    """Most passes over the logs; early stopping on held-out episodes ends it sooner."""
+    warm_start_std_floor: float = 0.2
+    """Smallest standard deviation of the cloned policy, in scaled actions, so that PPO can still explore."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What surrounds the learning."""
+
+    steps: int = 1_000_000
+    """Environment steps of the run (Table 2)."""
+    seed: int = 0
+    """Seed of everything random."""
+    eval_every: int = 10_000
+    """Environment steps between evaluations of the deterministic policy; 0: none but the last."""
+    eval_episodes: int = 5
+    """Episodes of an evaluation, side by side."""
+    checkpoint_every: int = 25
+    """Iterations between checkpoints; environments restart there, in every run."""
+    threads: int = 1
+    """Threads that step the environments."""
+    tensorboard: bool = True
+    """Write TensorBoard event files."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of one run."""
+
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    proposals: ProposalConfig = field(default_factory=ProposalConfig)
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    q: QConfig = field(default_factory=QConfig)
+    adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
+    warm: WarmStartConfig = field(default_factory=WarmStartConfig)
+    run: RunConfig = field(default_factory=RunConfig)
+
+    def __post_init__(self):
+        validate(self)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "tuned": {"lambda_kl": 0.05, "lambda_aux": 0.1},
+}
+
+
+def field_groups() -> dict[str, str]:
+    """Flat field name -> name of its group in `Config`."""
+    groups = typing.get_type_hints(Config)
+    return {f.name: group for group, cls in groups.items() for f in dataclasses.fields(cls)}
+
+
+def replace(config: Config, **options: Any) -> Config:
+    """`config` with flat `options` replaced; raises `InputError` for an unknown name or an impossible value."""
+    owner = field_groups()
+    changes: dict[str, dict[str, Any]] = {}
+    for name, value in options.items():
+        if name not in owner:
+            raise unknown("option", name, owner)
+        changes.setdefault(owner[name], {})[name] = value
+    groups = {g: dataclasses.replace(getattr(config, g), **values) for g, values in changes.items()}
+    return dataclasses.replace(config, **groups)
+
+
+def make(preset: str = "paper", **options: Any) -> Config:
+    """The named preset with flat `options` on top."""
+    if preset not in PRESETS:
+        raise unknown("preset", preset, PRESETS)
+    return replace(Config(), **{**PRESETS[preset], **options})
+
+
+def flatten(config: Config) -> dict[str, Any]:
+    """Flat name -> value, the inverse of `replace(Config(), **flat)`."""
+    return {name: getattr(getattr(config, group), name) for name, group in field_groups().items()}
+
+
+# name -> (predicate, what would be right); every number a user can set is in here.
+_positive = (lambda v: v > 0, "a number above 0")
+_at_least_0 = (lambda v: v >= 0, "a number of 0 or more")
+_share = (lambda v: 0 < v <= 1, "a number above 0 and at most 1")
+_RULES: dict[str, tuple[Any, str]] = {
+    **dict.fromkeys(
+        "num_envs rollout_steps minibatch_size num_epochs hidden_size num_proposals sampler_steps q_hidden_size q_epochs "
+        "pet_minibatch_size adapter_rank warm_start_epochs steps eval_episodes checkpoint_every threads learning_rate "
+        "max_grad_norm kl_target observation_clip reward_clip guidance_cap proxy_std_floor q_learning_rate "
+        "pet_learning_rate warm_start_std_floor clip_epsilon".split(),
+        _positive,
+    ),
+    **dict.fromkeys(
+        "value_coefficient beta_max alpha_max lambda_kl lambda_aux pet_frequency eval_every seed".split(), _at_least_0
+    ),
+    **dict.fromkeys("proposal_fraction beta_anneal".split(), _share),
+    **dict.fromkeys(("gamma", "gae_lambda"), (lambda v: 0 <= v <= 1, "a number from 0 to 1")),
+    **dict.fromkeys(("displacement_cap", "top_k"), (lambda v: v is None or v > 0, "a number above 0, or None")),
+    "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),
+}
+
+
+def validate(config: Config) -> None:
+    """Raise `InputError` for the first field whose type or value cannot work, naming what would be right."""
+    for group, cls in typing.get_type_hints(Config).items():
+        hints = typing.get_type_hints(cls)
+        for f in dataclasses.fields(cls):
+            _validate_field(f.name, getattr(getattr(config, group), f.name), hints[f.name])
+    ppo = config.ppo
+    if ppo.rollout_steps % ppo.num_envs:
+        raise InputError(f"rollout_steps {ppo.rollout_steps} must be a multiple of num_envs {ppo.num_envs}")
+    if ppo.rollout_steps % ppo.minibatch_size:
+        raise InputError(f"rollout_steps {ppo.rollout_steps} must be a multiple of minibatch_size {ppo.minibatch_size}")
+    if config.proposals.top_k is not None and config.proposals.top_k > config.proposals.num_proposals:
+        raise InputError(
+            f"top_k {config.proposals.top_k} must be at most num_proposals {config.proposals.num_proposals}"
+        )
+
+
+def _validate_field(name: str, value: Any, hint: Any) -> None:
+    if typing.get_origin(hint) is Literal:
+        if value not in typing.get_args(hint):
+            raise unknown(f"value of {name}", value, typing.get_args(hint))
+        return
+    allowed = typing.get_args(hint) or (hint,)
+    right_type = (
+        isinstance(value, allowed)
+        or (float in allowed and isinstance(value, int))
+    ) and (bool in allowed or not isinstance(value, bool))
+    if not right_type:
+        kinds = " or ".join("None" if t is type(None) else t.__name__ for t in allowed)
+        raise InputError(f"{name} must be {kinds}, not {value!r}")
+    if name in _RULES and (value != value or not _RULES[name][0](value)):
+        raise InputError(f"{name} must be {_RULES[name][1]}, not {value!r}")

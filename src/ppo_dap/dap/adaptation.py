@@ -1,0 +1,76 @@
+"""Step 5 of Algorithm 1: parameter-efficient tuning of the prior on D_on (4.2, L_PET)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from ppo_dap.config import AdaptationConfig
+from ppo_dap.nets.adapters import Adapters
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, denoising_loss
+
+Provenance = Callable[[Int[Array, " n"], Float[Array, "n obs"]], Float[Array, " n"]]
+"""(state_ids, raw states) -> 1 for each that is a row of D_on, else 0."""
+
+ADAM = optax.scale_by_adam(eps=1e-8)
+
+
+class PETData(eqx.Module):
+    """What PET draws its minibatches from. Actions are scaled and clipped: what the environment executed."""
+
+    state_ids: Int[Array, " rows"]
+    observations: Float[Array, "rows obs"]
+    """Raw: the prior has its own normaliser."""
+    actions: Float[Array, "rows act"]
+    weights: Float[Array, " rows"]
+
+
+def steps_until(iteration: int, pet_frequency: int, actor_updates: int) -> int:
+    """PET steps due in all of the first `iteration` iterations: f for every 100 actor updates, rounded down."""
+    return iteration * pet_frequency * actor_updates // 100
+
+
+def adapt(
+    denoiser: Denoiser,
+    adapters: Adapters,
+    optimizer: optax.OptState,
+    rows: PETData,
+    key: PRNGKeyArray,
+    num_steps: Int[Array, ""],
+    *,
+    diffusion: DiffusionConfig,
+    config: AdaptationConfig,
+    check: Provenance,
+) -> tuple[Adapters, optax.OptState, dict[str, Float[Array, ""]]]:
+    """`num_steps` Adam steps of L_PET in the adapters alone; the backbone is frozen.
+
+    Every minibatch goes through `check`; the metric `pet_spr` is the smallest share of a minibatch that passed.
+    """
+    condition = jnp.zeros((config.pet_minibatch_size, diffusion.num_conditions))
+    # Rows without weight (no transition happened) come last and are never drawn.
+    order = jnp.argsort(-rows.weights, stable=True)
+    num_valid = jnp.sum(rows.weights)
+
+    def step(i, carry):
+        adapters, optimizer, total, spr = carry
+        draw_key, loss_key = jax.random.split(jax.random.fold_in(key, i))
+        uniform = jax.random.uniform(draw_key, (config.pet_minibatch_size,))
+        index = order[jnp.floor(uniform * num_valid).astype(jnp.int32)]
+        batch = jax.tree.map(lambda x: x[index], rows)
+        loss, gradient = jax.value_and_grad(
+            lambda a: denoising_loss(denoiser, a, batch.observations, condition, batch.actions, loss_key, diffusion)
+        )(adapters)
+        updates, optimizer = ADAM.update(gradient, optimizer)
+        adapters = jax.tree.map(lambda p, u: p - config.pet_learning_rate * u, adapters, updates)
+        spr = jnp.minimum(spr, jnp.mean(check(batch.state_ids, batch.observations)))
+        return adapters, optimizer, total + loss, spr
+
+    carry = (adapters, optimizer, jnp.zeros(()), jnp.ones(()))
+    adapters, optimizer, total, spr = jax.lax.fori_loop(0, num_steps, step, carry)
+    return adapters, optimizer, {"pet_loss": total / jnp.maximum(num_steps, 1), "pet_spr": spr}

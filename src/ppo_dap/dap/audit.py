@@ -1,0 +1,214 @@
+"""Step 6 of Algorithm 1 and Definition 1 (4.5): what is measured in every iteration, and what is proved once.
+
+A run is strictly on-policy when the static claims hold for the traced update and the measured ones in every iteration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ppo_dap.config import PPOConfig, ProposalConfig
+from ppo_dap.dap.dataflow import Flow
+from ppo_dap.dap.objective import Batch, GatedProposals, Weights, admit, admit_proposals, proposal_terms
+from ppo_dap.dap.proposals import Proposals, gaussian_proxy
+from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
+from ppo_dap.nets.adapters import Adapters
+from ppo_dap.ppo.surrogate import weighted_mean
+from ppo_dap.ppo.update import Normaliser, Rows, ppo_loss
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
+from ppo_dap.priors.samplers import sample_actions
+
+DELTA = 1e-8
+PROXY_STATES = 32
+"""States on which the prior is sampled again for prior-KL and the KL to the frozen prior."""
+RATIO_TOLERANCE = 1e-3
+"""Largest |ratio - 1| at the first minibatch: rollout (numpy) and update (XLA) round differently, no more."""
+
+
+class Probe(eqx.Module):
+    """A minibatch of D_off for the leakage audit alone; actions are scaled."""
+
+    raw_observations: Float[Array, "n obs"]
+    actions: Float[Array, "n act"]
+
+
+def policy_metrics(actor: Actor, old_log_std: Float[Array, " act"], rows: Rows) -> dict[str, Float[Array, ""]]:
+    """policy-KL, E[KL(pi_{k+1} || pi_k)] on D_on (A.1), and the surrogate E[ratio * A] of Eq. 14."""
+    means = actor(rows.observations)
+    kl = gaussian_kl(means, actor.log_std[None], rows.old_means, old_log_std[None])
+    ratio = jnp.exp(log_prob(rows.actions, means, actor.log_std) - rows.old_log_probs)
+    return {
+        "policy_kl": weighted_mean(kl, rows.weights),
+        "surrogate": weighted_mean(ratio * rows.advantages, rows.weights),
+    }
+
+
+def leakage(
+    actor: Actor,
+    probe: Probe,
+    normaliser: Normaliser,
+    rows: Rows,
+    batch: Batch,
+    weights: Weights,
+    actor_gradient_norm: Float[Array, ""],
+    *,
+    ppo: PPOConfig,
+) -> dict[str, Float[Array, ""]]:
+    """OGLR (Eq. 11): a minibatch of logs pushed through the actor gradient of the real update, over the real norm.
+
+    `oglr` passes the gate of the real update, which must stop all of it; `oglr_ungated` shows what a leak would be.
+    """
+    n = probe.actions.shape[0]
+    observations = normaliser(probe.raw_observations, ppo.observation_clip)
+    means = actor(observations)
+    offline = Rows(
+        state_ids=-1 - jnp.arange(n, dtype=jnp.int32),
+        raw_observations=probe.raw_observations,
+        observations=observations,
+        actions=probe.actions,
+        old_log_probs=log_prob(probe.actions, means, actor.log_std),
+        old_means=means,
+        advantages=jnp.resize(rows.advantages, n),
+        returns=jnp.zeros(n),
+        q_targets=jnp.zeros(n),
+        weights=jnp.ones(n),
+    )
+    proposals = Proposals(
+        offline.state_ids,
+        probe.raw_observations,
+        observations,
+        probe.actions[:, None, :],
+        probe.actions,
+        jnp.ones_like(probe.actions),
+    )
+
+    def norm(rows: Rows, gated: GatedProposals):
+        def loss(actor: Actor):
+            return ppo_loss(actor, rows, ppo.clip_epsilon)[0] + proposal_terms(actor, gated, weights)[0]
+
+        return tree_norm(jax.grad(loss)(actor)) / (actor_gradient_norm + DELTA)
+
+    return {
+        "oglr": norm(admit(offline, batch), admit_proposals(proposals, batch)),
+        "oglr_ungated": norm(offline, GatedProposals(proposals, jnp.ones(n))),
+    }
+
+
+def prior_metrics(
+    actor: Actor,
+    denoiser: Denoiser,
+    before: Adapters,
+    after: Adapters,
+    proposals: Proposals,
+    key: PRNGKeyArray,
+    *,
+    diffusion: DiffusionConfig,
+    config: ProposalConfig,
+) -> dict[str, Float[Array, ""]]:
+    """prior-KL, E[KL(p_{k+1} || p_k)] by the Gaussian proxy (A.1), and the KLs of the policy to the prior.
+
+    The prior is sampled with the same noise before and after PET and frozen, so that "small prior-KL" is not noise and
+    "nothing moved" shows.
+    """
+    few = jax.tree.map(lambda x: x[:PROXY_STATES], proposals)
+    condition = jnp.zeros((few.observations.shape[0], diffusion.num_conditions))
+
+    def proxy(adapters: Adapters | None):
+        actions, _ = sample_actions(
+            denoiser,
+            adapters,
+            few.raw_observations,
+            condition,
+            key,
+            config.num_proposals,
+            diffusion,
+            sampler=config.sampler,
+            num_steps=config.sampler_steps,
+        )
+        mean, std = gaussian_proxy(actions, config.proxy_std_floor)
+        return mean, jnp.log(std)
+
+    frozen, old, new = proxy(None), proxy(before), proxy(after)
+    log_std = actor.log_std[None]
+    return {
+        "prior_kl": jnp.mean(gaussian_kl(*new, *old)),
+        "prior_drift": jnp.mean(gaussian_kl(*new, *frozen)),
+        "kl_to_frozen_prior": jnp.mean(gaussian_kl(actor(few.observations), log_std, *frozen)),
+        "kl_to_prior": jnp.mean(
+            gaussian_kl(actor(proposals.observations), log_std, proposals.proxy_mean, jnp.log(proposals.proxy_std))
+        ),
+    }
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One checked statement of Definition 1."""
+
+    clause: str
+    statement: str
+    holds: bool
+    evidence: str
+
+    def __str__(self) -> str:
+        return f"{'holds   ' if self.holds else 'VIOLATED'} {self.clause:6} {self.statement}: {self.evidence}"
+
+
+FORBIDDEN: tuple[tuple[str, str, str, str, frozenset[str]], ...] = (
+    # clause, statement, which flow, output or tag, labels that must not reach it
+    ("(i)", "the importance ratio is made of theta and D_on", "cut", "tag:ratio", frozenset({"proposals", "offline", "backbone", "adapters", "q"})),
+    ("(i)", "the advantages are made of V and D_on", "full", "tag:advantages", frozenset({"proposals", "offline", "backbone", "adapters", "q"})),
+    ("(i)", "V and its trunk learn from D_on alone, not from Q or proposals", "full", "out:critic", frozenset({"proposals", "offline", "backbone", "adapters", "q"})),
+    ("(iii)", "PET's gradient is made of D_on and the prior, not of actor, critic, Q, proposals or logs", "full", "out:adapters", frozenset({"proposals", "offline", "actor", "critic", "q", "ppo_optimizers"})),
+    ("(iv)", "no array of D_off reaches the new policy", "full", "out:actor", frozenset({"offline"})),
+    ("(iv)", "no array of D_off reaches the optimizers, Q or the prior", "full", "out:rest", frozenset({"offline"})),
+)
+
+
+def static_claims(full: Flow, cut: Flow) -> list[Claim]:
+    """The data-flow proof: `full` is the traced update, `cut` the same with theta taken as given at each minibatch.
+
+    The cut is needed since proposals do reach theta, through Eq. 9, and theta reaches the next minibatch's ratio.
+    """
+    claims = []
+    for clause, statement, which, where, forbidden in FORBIDDEN:
+        flow = cut if which == "cut" else full
+        kind, name = where.split(":")
+        found = flow.tags if kind == "tag" else flow.outputs
+        if name not in found:
+            if name == "adapters":
+                continue
+            claims.append(Claim(clause, statement, False, f"{name} was not found in the traced program"))
+            continue
+        reached = found[name] & forbidden
+        evidence = f"reached by {', '.join(sorted(reached))}" if reached else "proved on the traced program"
+        claims.append(Claim(clause, statement, not reached, evidence))
+    return claims
+
+
+def _worst(rows: Iterable[Mapping[str, Any]], name: str, largest: bool) -> float | None:
+    values = [row[name] for row in rows if row.get(name) is not None]
+    return (max(values) if largest else min(values)) if values else None
+
+
+def measured_claims(metrics: list[Mapping[str, Any]]) -> list[Claim]:
+    """Definition 1 on what was logged: the worst value over all iterations counts."""
+    checks = (
+        ("(i)", "every row of the actor update is of the current batch (share)", "batch_fresh", False, lambda v: v == 1),
+        ("(i)", "ratio is 1 at the first minibatch (largest error)", "ratio_error", True, lambda v: v < RATIO_TOLERANCE),
+        ("(ii)", "SPR, smallest", "spr", False, lambda v: v == 1),
+        ("(iii)", "share of PET rows from the current batch, smallest", "pet_spr", False, lambda v: v == 1),
+        ("(iv)", "OGLR, largest", "oglr", True, lambda v: v == 0),
+    )
+    claims = []
+    for clause, statement, name, largest, right in checks:
+        worst = _worst(metrics, name, largest)
+        if worst is not None:
+            claims.append(Claim(clause, statement, bool(right(worst)), f"{worst:.3g} over {len(metrics)} iterations"))
+    return claims

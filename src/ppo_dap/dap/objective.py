@@ -1,0 +1,87 @@
+"""What the actor objective adds to PPO (4.4): the last two terms of Eq. 9, behind the provenance gate."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ppo_dap.dap.proposals import Proposals
+from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob
+from ppo_dap.ppo.surrogate import weighted_mean
+from ppo_dap.ppo.update import Rows
+
+
+class Weights(NamedTuple):
+    """Weights of Eq. 9 in this iteration."""
+
+    lambda_kl: Float[Array, ""]
+    lambda_aux: Float[Array, ""]
+
+
+class GatedProposals(eqx.Module):
+    """Proposals with the gate that each has passed (1) or not (0)."""
+
+    proposals: Proposals
+    gate: Float[Array, " n"]
+
+
+class Batch(NamedTuple):
+    """D_on of the current iteration as the gate knows it."""
+
+    first_id: Int[Array, ""]
+    """state_id that its first row must have, from the learner's own count of iterations: an old batch has others."""
+    raw_observations: Float[Array, "rows obs"]
+    weights: Float[Array, " rows"]
+
+
+def provenance(
+    state_ids: Int[Array, " n"], raw_observations: Float[Array, "n obs"], batch: Batch
+) -> Float[Array, " n"]:
+    """1 for every (state_id, state) that is a row of D_on with weight, else 0: the id and the state itself must match."""
+    row = state_ids - batch.first_id
+    inside = (row >= 0) & (row < batch.weights.shape[0])
+    row = jnp.where(inside, row, 0)
+    same_state = jnp.all(batch.raw_observations[row] == raw_observations, axis=-1)
+    return (inside & same_state & (batch.weights[row] > 0)).astype(jnp.float32)
+
+
+def admit(rows: Rows, batch: Batch) -> Rows:
+    """`rows` with weight only where they are of D_on: what every actor gradient is computed from."""
+    gate = provenance(rows.state_ids, rows.raw_observations, batch)
+    return eqx.tree_at(lambda r: r.weights, rows, rows.weights * gate)
+
+
+def admit_proposals(proposals: Proposals, batch: Batch) -> GatedProposals:
+    """Proposals with the gate of their states."""
+    return GatedProposals(proposals, provenance(proposals.state_ids, proposals.raw_observations, batch))
+
+
+def proposal_terms(
+    actor: Actor, gated: GatedProposals, weights: Weights
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """The last two terms of Eq. 9, to be minimised, as means over the gated states.
+
+    lambda_KL E[KL(pi || proxy)] + lambda_aux E[-log pi(a | s)]. Proposals and proxy are numbers here: no gradient
+    can reach the prior.
+    """
+    proposals, gate = jax.lax.stop_gradient((gated.proposals, gated.gate))
+    means = actor(proposals.observations)
+    kl = gaussian_kl(means, actor.log_std[None], proposals.proxy_mean, jnp.log(proposals.proxy_std))
+    kl_loss = weighted_mean(kl, gate)
+    repeated = jnp.broadcast_to(means[:, None, :], proposals.actions.shape)
+    nll = -jnp.mean(log_prob(proposals.actions, repeated, actor.log_std), axis=1)
+    aux_loss = weighted_mean(nll, gate)
+    loss = weights.lambda_kl * kl_loss + weights.lambda_aux * aux_loss
+    return loss, {"kl_loss": kl_loss, "aux_loss": aux_loss}
+
+
+def proposal_gradient(
+    actor: Actor, gated: GatedProposals, weights: Weights
+) -> tuple[Actor, dict[str, Float[Array, ""]]]:
+    """Gradient of `proposal_terms` in the actor's parameters: what is added to PPO's."""
+    gradient, metrics = jax.grad(proposal_terms, has_aux=True)(actor, gated, weights)
+    return gradient, metrics

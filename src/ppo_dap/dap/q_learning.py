@@ -1,0 +1,72 @@
+"""The Q head's one-step TD fit (4.4): a stage of its own, with its own optimizer, after PPO's update."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ppo_dap.config import QConfig
+from ppo_dap.nets.critic import Critic, QFunction, q_features
+from ppo_dap.ppo.surrogate import weighted_mean
+
+ADAM = optax.scale_by_adam(eps=1e-5)
+
+
+class QData(eqx.Module):
+    """Rows of D_on as Q's regression sees them; actions are scaled and clipped: what the environment executed."""
+
+    observations: Float[Array, "rows obs"]
+    actions: Float[Array, "rows act"]
+    targets: Float[Array, " rows"]
+    weights: Float[Array, " rows"]
+
+
+def q_loss(
+    q: QFunction, critic: Critic, rows: QData, shared: bool
+) -> Float[Array, ""]:
+    """Mean squared error of Q(s, a) against r + gamma (1 - terminated) V(s')."""
+    features = q_features(critic, q, rows.observations, shared)
+    values = q(features, rows.actions[:, None, :])[:, 0]
+    return weighted_mean(jnp.square(values - rows.targets), rows.weights)
+
+
+def trainable(q: QFunction, critic: Critic, config: QConfig):
+    """What Q's gradient may move: Q, and with `q_trunk = "shared"` the value trunk as well."""
+    return (q, critic.trunk) if config.q_trunk == "shared" else (q,)
+
+
+def fit_q(
+    q: QFunction,
+    critic: Critic,
+    optimizer: optax.OptState,
+    rows: QData,
+    key: PRNGKeyArray,
+    *,
+    minibatch_size: int,
+    config: QConfig,
+) -> tuple[QFunction, Critic, optax.OptState, Float[Array, ""]]:
+    """`q_epochs` passes over D_on. The critic comes back as it was, except its trunk when it is shared."""
+    num_minibatches = rows.targets.shape[0] // minibatch_size
+    shared = config.q_trunk == "shared"
+
+    def with_trunk(params):
+        return eqx.tree_at(lambda c: c.trunk, critic, params[1]) if shared else critic
+
+    def step(carry, batch):
+        params, optimizer = carry
+        loss, gradient = jax.value_and_grad(lambda p: q_loss(p[0], with_trunk(p), batch, shared))(params)
+        updates, optimizer = ADAM.update(gradient, optimizer)
+        params = jax.tree.map(lambda p, u: p - config.q_learning_rate * u, params, updates)
+        return (params, optimizer), loss
+
+    def epoch(carry, epoch_key):
+        order = jax.random.permutation(epoch_key, rows.targets.shape[0])
+        batches = jax.tree.map(lambda x: x[order].reshape(num_minibatches, -1, *x.shape[1:]), rows)
+        return jax.lax.scan(step, carry, batches)
+
+    start = (trainable(q, critic, config), optimizer)
+    (params, optimizer), losses = jax.lax.scan(epoch, start, jax.random.split(key, config.q_epochs))
+    return params[0], with_trunk(params), optimizer, jnp.mean(losses)

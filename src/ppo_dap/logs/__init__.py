@@ -1,0 +1,18 @@
+"""D_off, the logged trajectories: reading, checking, splitting and writing them. Knows nothing of learning."""
+
+from ppo_dap.logs.check import Finding, Report, check_logs, require_compatible
+from ppo_dap.logs.dataset import Logs, LogsWarning
+from ppo_dap.logs.formats import load_logs, sample_names
+from ppo_dap.logs.npz import save_npz
+
+__all__ = [
+    "Finding",
+    "Logs",
+    "LogsWarning",
+    "Report",
+    "check_logs",
+    "load_logs",
+    "require_compatible",
+    "sample_names",
+    "save_npz",
+]

@@ -1,0 +1,76 @@
+"""The critic: one trunk with a value head, and the action-value function that guides proposals."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ppo_dap.nets.mlp import MLP, Linear
+
+
+class Critic(eqx.Module):
+    """V_phi(s): tanh trunk and a linear head."""
+
+    trunk: MLP
+    v_head: Linear
+
+    @staticmethod
+    def create(key: PRNGKeyArray, observation_size: int, hidden_size: int) -> Critic:
+        """Orthogonal start, gain 1 on the value head."""
+        trunk_key, head_key = jax.random.split(key)
+        return Critic(create_trunk(trunk_key, observation_size, hidden_size), Linear.orthogonal(head_key, hidden_size, 1, 1.0))
+
+    def features(self, observations: Float[Array, "n obs"]) -> Float[Array, "n width"]:
+        """The trunk's features, which Q may read."""
+        return jnp.tanh(self.trunk(observations))
+
+    def __call__(self, observations: Float[Array, "n obs"]) -> Float[Array, " n"]:
+        """Values, in scaled-reward units."""
+        return self.v_head(self.features(observations))[:, 0]
+
+
+def create_trunk(key: PRNGKeyArray, observation_size: int, hidden_size: int) -> MLP:
+    """Two layers of `hidden_size`; `Critic.features` squashes the last one too."""
+    return MLP.create(key, (observation_size, hidden_size, hidden_size), "tanh", final_gain=2**0.5)
+
+
+class QFunction(eqx.Module):
+    """Q_phi(s, a) for guidance only: the state part is computed once per state, the action part once per proposal."""
+
+    trunk: MLP | None
+    state: Linear
+    action: Linear
+    out: Linear
+
+    @staticmethod
+    def create(
+        key: PRNGKeyArray, observation_size: int, action_size: int, feature_size: int, hidden_size: int, own_trunk: bool
+    ) -> QFunction:
+        """A head on features of `feature_size`, with a trunk of its own when `own_trunk`."""
+        keys = jax.random.split(key, 4)
+        trunk = create_trunk(keys[0], observation_size, feature_size) if own_trunk else None
+        return QFunction(
+            trunk,
+            Linear.orthogonal(keys[1], feature_size, hidden_size, 2**0.5),
+            Linear.orthogonal(keys[2], action_size, hidden_size, 2**0.5),
+            Linear.orthogonal(keys[3], hidden_size, 1, 1.0),
+        )
+
+    def __call__(
+        self, features: Float[Array, "n width"], actions: Float[Array, "n k act"]
+    ) -> Float[Array, "n k"]:
+        """Q at k actions of each state, in scaled-reward units; actions are scaled."""
+        hidden = jnp.tanh(self.state(features)[:, None, :] + self.action(actions))
+        return self.out(hidden)[..., 0]
+
+
+def q_features(
+    critic: Critic, q: QFunction, observations: Float[Array, "n obs"], shared: bool
+) -> Float[Array, "n width"]:
+    """What Q reads: its own trunk if it has one, else V's trunk, with the gradient stopped unless `shared`."""
+    if q.trunk is not None:
+        return jnp.tanh(q.trunk(observations))
+    features = critic.features(observations)
+    return features if shared else jax.lax.stop_gradient(features)

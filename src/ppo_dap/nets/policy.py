@@ -1,0 +1,96 @@
+"""The policy in plain numpy: what rollouts and evaluation step with, and what a user deploys. No JAX needed."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ppo_dap.errors import InputError
+from ppo_dap.nets.storage import read_tensors, write_tensors
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A Gaussian policy with its observation normaliser and action scaling inside."""
+
+    weights: tuple[Float[np.ndarray, "out in"], ...]
+    biases: tuple[Float[np.ndarray, " out"], ...]
+    log_std: Float[np.ndarray, " act"]
+    observation_mean: Float[np.ndarray, " obs"]
+    observation_std: Float[np.ndarray, " obs"]
+    observation_clip: float
+    action_low: Float[np.ndarray, " act"]
+    action_high: Float[np.ndarray, " act"]
+    task: str | None = None
+
+    def mean(self, observations: Float[np.ndarray, "n obs"]) -> Float[np.ndarray, "n act"]:
+        """Means in scaled actions at raw observations."""
+        hidden = (observations - self.observation_mean) / self.observation_std
+        hidden = np.clip(hidden, -self.observation_clip, self.observation_clip)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = np.tanh(hidden @ weight.T + bias)
+        return hidden @ self.weights[-1].T + self.biases[-1]
+
+    def log_prob_of_noise(self, noise: Float[np.ndarray, "n act"]) -> Float[np.ndarray, " n"]:
+        """Log-density of mean + std * noise."""
+        constant = self.log_std.sum() + 0.5 * math.log(2 * math.pi) * len(self.log_std)
+        return -0.5 * np.square(noise).sum(-1) - np.float32(constant)
+
+    def unscale(self, actions: Float[np.ndarray, "n act"]) -> Float[np.ndarray, "n act"]:
+        """Scaled actions, clipped to the box, in environment units."""
+        return unscale_actions(actions, self.action_low, self.action_high)
+
+    def __call__(self, observation) -> np.ndarray:
+        """Deterministic action in environment units for one observation (obs,) or a batch (n, obs).
+
+        Raises `InputError` if the observation has another size than the policy was trained with.
+        """
+        observations = np.asarray(observation, dtype=np.float32)
+        if observations.ndim not in (1, 2) or observations.shape[-1] != len(self.observation_mean):
+            raise InputError(
+                f"observation of shape {observations.shape}: this policy takes ({len(self.observation_mean)},) or "
+                f"(n, {len(self.observation_mean)})"
+            )
+        actions = self.unscale(self.mean(np.atleast_2d(observations)))
+        return actions if observations.ndim == 2 else actions[0]
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write one safetensors file, atomically."""
+        tensors = {f"weight{i}": w for i, w in enumerate(self.weights)}
+        tensors |= {f"bias{i}": b for i, b in enumerate(self.biases)}
+        for name in ("log_std", "observation_mean", "observation_std", "action_low", "action_high"):
+            tensors[name] = getattr(self, name)
+        meta = {"kind": "policy", "format": FORMAT, "task": self.task, "observation_clip": self.observation_clip}
+        write_tensors(Path(path), tensors, meta)
+
+
+def load_policy(path: str | os.PathLike) -> Policy:
+    """Read a file that `Policy.save` wrote; raises `InputError` for anything else."""
+    tensors, meta = read_tensors(Path(path), kind="policy", newest=FORMAT)
+    depth = sum(name.startswith("weight") for name in tensors)
+    return Policy(
+        tuple(tensors[f"weight{i}"] for i in range(depth)),
+        tuple(tensors[f"bias{i}"] for i in range(depth)),
+        *(tensors[name] for name in ("log_std", "observation_mean", "observation_std")),
+        float(meta["observation_clip"]),
+        tensors["action_low"],
+        tensors["action_high"],
+        meta["task"],
+    )
+
+
+def unscale_actions(actions: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """[-1, 1] to [low, high]; what lies outside is clipped first."""
+    return low + (np.clip(actions, -1.0, 1.0) + 1.0) * (0.5 * (high - low))
+
+
+def scale_actions(actions: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """[low, high] to [-1, 1]."""
+    return (actions - low) / (0.5 * (high - low)) - 1.0

@@ -1,0 +1,58 @@
+"""Arrays and JSON in one file: safetensors, written atomically, no pickle anywhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ppo_dap.errors import InputError
+
+
+def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+    """Write `tensors` and the JSON-able `meta` to `path`: whole or not at all, the file before it stays until then."""
+    from safetensors.numpy import save
+
+    header = {"meta": json.dumps(dict(meta), sort_keys=True)}
+    contiguous = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
+    write_atomically(path, save(contiguous, metadata=header))
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace `path` by `content` in one step; missing folders are made. Raises `OSError` with `path` as it was."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with open(partial, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_tensors(path: Path, kind: str, newest: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and meta of a file of this `kind`, whose format is at most `newest`; raises `InputError` otherwise."""
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise InputError(f"no {kind} file at {path}")
+    try:
+        with safe_open(path, framework="np") as file:
+            meta = json.loads((file.metadata() or {}).get("meta", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, ValueError, OSError) as error:
+        raise InputError(f"{path} is not a whole {kind} file: {error}") from error
+    if meta.get("kind") != kind:
+        raise InputError(f"{path} is not a {kind} file but a {meta.get('kind', 'foreign safetensors')} file")
+    if meta.get("format", 0) > newest:
+        raise InputError(
+            f"{path} has {kind} format {meta['format']}, this version of ppo-dap reads up to {newest}: update ppo-dap"
+        )
+    return tensors, meta

@@ -1,0 +1,234 @@
+"""Steps 2 and 4 of Algorithm 1 for PPO itself: advantages of D_on, then epochs of minibatch steps.
+
+The gradient of what a method adds to PPO's objective comes in as a function, is computed on its own and is added after
+PPO's gradient: PPO's part of the program is the same whether there is such a term or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from ppo_dap.config import PPOConfig
+from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
+from ppo_dap.nets.critic import Critic
+from ppo_dap.ppo.gae import gae
+from ppo_dap.ppo.rollout import Rollout
+from ppo_dap.ppo.surrogate import clipped_surrogate, importance_ratio, normalise, weighted_mean
+
+ADAM = optax.scale_by_adam(eps=1e-5)
+
+
+class PPOState(eqx.Module):
+    """What PPO updates: networks and their optimizers, apart from everything of the prior."""
+
+    actor: Actor
+    critic: Critic
+    actor_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+
+    @staticmethod
+    def create(key: PRNGKeyArray, observation_size: int, action_size: int, hidden_size: int) -> PPOState:
+        """Fresh networks."""
+        actor_key, critic_key = jax.random.split(key)
+        actor = Actor.create(actor_key, observation_size, action_size, hidden_size)
+        critic = Critic.create(critic_key, observation_size, hidden_size)
+        return PPOState(actor, critic, ADAM.init(actor), ADAM.init(critic))
+
+
+class Rows(eqx.Module):
+    """D_on flattened to rows, with all that the update needs; `observations` are normalised and clipped."""
+
+    state_ids: Int[Array, " rows"]
+    raw_observations: Float[Array, "rows obs"]
+    observations: Float[Array, "rows obs"]
+    actions: Float[Array, "rows act"]
+    old_log_probs: Float[Array, " rows"]
+    old_means: Float[Array, "rows act"]
+    advantages: Float[Array, " rows"]
+    returns: Float[Array, " rows"]
+    q_targets: Float[Array, " rows"]
+    weights: Float[Array, " rows"]
+    """1, or 0 for a row in which no transition happened."""
+
+
+class Normaliser(NamedTuple):
+    """Statistics frozen for one iteration."""
+
+    mean: Float[Array, " obs"]
+    std: Float[Array, " obs"]
+    reward_std: Float[Array, ""]
+
+    def __call__(self, observations: Float[Array, "*n obs"], clip: float) -> Float[Array, "*n obs"]:
+        """Normalised observations."""
+        shape = observations.shape
+        mean, std = jnp.broadcast_to(self.mean, shape), jnp.broadcast_to(self.std, shape)
+        return jnp.clip((observations - mean) / std, -clip, clip)
+
+
+def estimate_advantages(critic: Critic, rollout: Rollout, normaliser: Normaliser, ppo: PPOConfig) -> Rows:
+    """Step 2: values, GAE, regression targets; and the one-step target of Q, r + gamma (1 - terminated) V(s')."""
+    time, envs = rollout.rewards.shape
+
+    def flat(x):
+        return x.reshape(time * envs, *x.shape[2:])
+
+    observations = normaliser(flat(rollout.observations), ppo.observation_clip)
+    successors = normaliser(flat(rollout.next_observations), ppo.observation_clip)
+    values, next_values = critic(observations), critic(successors)
+    rewards = jnp.clip(rollout.rewards / normaliser.reward_std, -ppo.reward_clip, ppo.reward_clip)
+    grid = (time, envs)
+    advantages = gae(
+        rewards,
+        values.reshape(grid),
+        next_values.reshape(grid),
+        rollout.terminated,
+        rollout.truncated,
+        rollout.valid,
+        ppo.gamma,
+        ppo.gae_lambda,
+    )
+    advantages = checkpoint_name(flat(advantages), "advantages")
+    return Rows(
+        state_ids=flat(rollout.state_ids),
+        raw_observations=flat(rollout.observations),
+        observations=observations,
+        actions=flat(rollout.actions),
+        old_log_probs=flat(rollout.log_probs),
+        old_means=flat(rollout.means),
+        advantages=advantages,
+        returns=advantages + values,
+        q_targets=flat(rewards) + ppo.gamma * jnp.where(flat(rollout.terminated), 0.0, next_values),
+        weights=flat(rollout.valid).astype(jnp.float32),
+    )
+
+
+def ppo_loss(actor: Actor, rows: Rows, clip_epsilon: float) -> tuple[Float[Array, ""], tuple]:
+    """Minus Eq. 5 on a minibatch; also the exact KL(pi_theta || pi_old) and the ratio."""
+    means = actor(rows.observations)
+    ratio = importance_ratio(log_prob(rows.actions, means, actor.log_std), rows.old_log_probs)
+    advantages = normalise(rows.advantages, rows.weights)
+    return -clipped_surrogate(ratio, advantages, rows.weights, clip_epsilon), (means, ratio)
+
+
+def value_loss(critic: Critic, rows: Rows) -> Float[Array, ""]:
+    """Mean squared error of V against GAE's returns."""
+    return weighted_mean(jnp.square(critic(rows.observations) - rows.returns), rows.weights)
+
+
+AddedGradient = Callable[[Actor, Any, Any], tuple[Actor, dict[str, Float[Array, ""]]]]
+"""(actor, minibatch of what the method adds, its weights) -> gradient to add to PPO's, and metrics."""
+
+
+class Settings(NamedTuple):
+    """Numbers that change from iteration to iteration (traced, so that nothing recompiles)."""
+
+    learning_rate: Float[Array, ""]
+    kl_limit: Float[Array, ""]
+    """Epochs stop after one whose mean policy-KL exceeds this; infinite when `kl_rule` is another."""
+    added_weights: Any = ()
+    """Weights of what the method adds (Eq. 9)."""
+
+
+def improve(
+    state: PPOState,
+    rows: Rows,
+    added: Any,
+    key: PRNGKeyArray,
+    settings: Settings,
+    *,
+    ppo: PPOConfig,
+    added_gradient: AddedGradient | None = None,
+) -> tuple[PPOState, dict[str, Float[Array, ""]]]:
+    """Step 4: `num_epochs` passes over D_on in shuffled minibatches.
+
+    `added` holds what `added_gradient` sees, leading axis a multiple of the number of minibatches (or no rows at all);
+    it is shuffled and dealt out like D_on's rows, by a random stream of its own.
+    """
+    num_minibatches = ppo.rollout_steps // ppo.minibatch_size
+    old_log_std = state.actor.log_std
+
+    def minibatch_step(carry, batch):
+        state, _ = carry
+        own, extra = batch
+        state, metrics = _minibatch_step(state, own, extra, settings, old_log_std, ppo, added_gradient)
+        return (state, metrics["policy_kl_minibatch"]), metrics
+
+    def epoch(carry, epoch_key):
+        def run(state):
+            batches = (_deal(rows, epoch_key, num_minibatches), _deal(added, jax.random.fold_in(epoch_key, 1), num_minibatches))
+            (state, _), metrics = jax.lax.scan(minibatch_step, (state, jnp.zeros(())), batches)
+            stop = jnp.mean(metrics["policy_kl_minibatch"]) > settings.kl_limit
+            return state, stop, metrics
+
+        def skip(state):
+            shapes = jax.eval_shape(run, state)[2]
+            return state, jnp.array(True), jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), shapes)
+
+        state, stopped = carry
+        state, stopped, metrics = jax.lax.cond(stopped, skip, run, state)
+        return (state, stopped), metrics
+
+    carry = (state, jnp.array(False))
+    (state, _), metrics = jax.lax.scan(epoch, carry, jax.random.split(key, ppo.num_epochs))
+    summary = {name: jnp.nanmean(values) for name, values in metrics.items()}
+    summary["ratio_error"] = metrics["ratio_error"][0, 0]
+    summary["actor_updates"] = jnp.sum(~jnp.isnan(metrics["ppo_loss"])).astype(jnp.float32)
+    return state, summary
+
+
+def _minibatch_step(state, own: Rows, extra, settings: Settings, old_log_std, ppo: PPOConfig, added_gradient):
+    actor = checkpoint_name_tree(state.actor, "theta")
+    (loss, (means, ratio)), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(actor, own, ppo.clip_epsilon)
+    # The barrier keeps the compiler from fusing PPO's gradient with what is added to it: same bits with and without.
+    gradient, loss, means, ratio = jax.lax.optimization_barrier((gradient, loss, means, ratio))
+    v_loss, v_gradient = jax.value_and_grad(value_loss)(state.critic, own)
+    policy_kl = weighted_mean(
+        gaussian_kl(means, actor.log_std[None], own.old_means, old_log_std[None]), own.weights
+    )
+    metrics = {
+        "ppo_loss": loss,
+        "value_loss": v_loss,
+        "policy_kl_minibatch": policy_kl,
+        "ratio_error": jnp.max(jnp.abs(ratio - 1) * own.weights),
+    }
+    ppo_norm = tree_norm(gradient)
+    total = gradient
+    if added_gradient is not None:
+        extra_gradient, extra_metrics = added_gradient(actor, extra, settings.added_weights)
+        extra_gradient = jax.lax.optimization_barrier(extra_gradient)
+        total = jax.tree.map(jnp.add, gradient, extra_gradient)
+        metrics |= extra_metrics
+    metrics["actor_gradient_norm"] = tree_norm(total)
+    metrics["pgshare"] = ppo_norm / (metrics["actor_gradient_norm"] + 1e-8)
+    rate = settings.learning_rate
+    actor, actor_optimizer = _adam(state.actor, total, state.actor_optimizer, rate, ppo.max_grad_norm)
+    v_gradient = jax.tree.map(lambda g: ppo.value_coefficient * g, v_gradient)
+    critic, critic_optimizer = _adam(state.critic, v_gradient, state.critic_optimizer, rate, ppo.max_grad_norm)
+    return PPOState(actor, critic, actor_optimizer, critic_optimizer), metrics
+
+
+def _adam(params, gradient, optimizer_state, learning_rate, max_norm: float):
+    scale = jnp.minimum(1.0, max_norm / (tree_norm(gradient) + 1e-6))
+    gradient = jax.tree.map(lambda g: g * scale, gradient)
+    updates, optimizer_state = ADAM.update(gradient, optimizer_state)
+    return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), optimizer_state
+
+
+def _deal(rows, key: PRNGKeyArray, num_minibatches: int):
+    """Rows in a new random order, with a leading axis of minibatches."""
+    count = jax.tree.leaves(rows)[0].shape[0] if jax.tree.leaves(rows) else 0
+    order = jax.random.permutation(key, count)
+    return jax.tree.map(lambda x: x[order].reshape(num_minibatches, -1, *x.shape[1:]), rows)
+
+
+def checkpoint_name_tree(tree, name: str):
+    """`checkpoint_name` on every leaf."""
+    return jax.tree.map(lambda leaf: checkpoint_name(leaf, name), tree)

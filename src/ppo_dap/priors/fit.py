@@ -1,0 +1,207 @@
+"""Stage I: fit a prior to logs (Section 4.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ppo_dap.errors import InputError, TrainingDiverged, unknown
+from ppo_dap.logs.dataset import Logs
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, denoising_loss
+from ppo_dap.priors.prior import DiffusionPrior, scale_actions
+
+PROBE_ROWS = 256
+VALIDATION_ROWS = 8192
+SMALLEST_SIGMA_DATA = 0.05
+
+
+class Rows(NamedTuple):
+    """Rows to fit to, with scaled actions."""
+
+    observations: Float[Array, "rows obs"]
+    condition: Float[Array, "rows c"]
+    actions: Float[Array, "rows act"]
+
+
+class FitProgress(NamedTuple):
+    """What a progress callback is told after each chunk of steps."""
+
+    step: int
+    max_steps: int
+    train_loss: float
+    validation_loss: float
+    seconds: float
+
+
+class FitState(NamedTuple):
+    """Everything that changes from step to step."""
+
+    denoiser: Denoiser
+    ema: Denoiser
+    optimizer: Any
+    step: Array
+
+
+Progress = Callable[[FitProgress], None]
+
+
+def fit_prior(
+    logs: Logs, kind: str = "diffusion", *, seed: int = 0, progress: Progress | None = None, **options: Any
+) -> DiffusionPrior:
+    """Fit a prior of the given kind to `logs`.
+
+    Options are the fields of the kind's config (`DiffusionConfig`), and `action_low` and `action_high` for logs that
+    do not carry the action space's bounds, or carry infinite ones.
+    """
+    if kind not in _FITTERS:
+        raise unknown("prior kind", kind, _FITTERS)
+    return _FITTERS[kind](logs, seed, progress, options)
+
+
+def fit_diffusion(logs: Logs, seed: int, progress: Progress | None, options: dict[str, Any]) -> DiffusionPrior:
+    """Stage I for the diffusion prior: Eq. 6 on the logs' rows, stopped on held-out episodes."""
+    low, high, options = _bounds(logs, options)
+    known = [f.name for f in dataclasses.fields(DiffusionConfig)]
+    for name in options:
+        if name not in known:
+            raise unknown("option of the diffusion prior", name, [*known, "action_low", "action_high"])
+    config = DiffusionConfig(**options)
+    if config.num_conditions:
+        raise InputError("num_conditions must be 0: logs carry no condition (use train_denoiser with rows that do)")
+    train, held_out = (_rows(part, low, high) for part in logs.split(config.validation_fraction, seed))
+    denoiser, training = train_denoiser(train, held_out, config, jax.random.key(seed), progress)
+    chosen = np.random.default_rng(seed).permutation(train.actions.shape[0])[:PROBE_ROWS]
+    return DiffusionPrior(
+        denoiser=denoiser,
+        config=config,
+        action_low=low,
+        action_high=high,
+        task=logs.task,
+        logs_hash=logs.hash(),
+        training={"seed": seed, **training},
+        probe_observations=np.asarray(train.observations)[chosen],
+        probe_actions=np.asarray(train.actions)[chosen],
+    )
+
+
+_FITTERS = {"diffusion": fit_diffusion}
+
+
+def _bounds(logs: Logs, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """The action space's bounds, from the options or else from the logs, and the options that are left."""
+    rest = dict(options)
+    low, high = rest.pop("action_low", None), rest.pop("action_high", None)
+    low, high = logs.action_low if low is None else low, logs.action_high if high is None else high
+    if low is None or high is None:
+        raise InputError("these logs carry no action bounds: pass action_low and action_high")
+    size = logs.actions.shape[1]
+    try:
+        bounds = [np.broadcast_to(np.asarray(bound, np.float32), (size,)).copy() for bound in (low, high)]
+    except ValueError:
+        raise InputError(f"action_low and action_high must be a number or {size} numbers") from None
+    if not (np.all(np.isfinite(bounds)) and np.all(bounds[0] <= bounds[1])):
+        raise InputError(f"action_low {low} and action_high {high} must be finite, low <= high")
+    return bounds[0], bounds[1], rest
+
+
+def _rows(logs: Logs, low: np.ndarray, high: np.ndarray) -> Rows:
+    observations = np.asarray(logs.observations, np.float32)
+    actions = scale_actions(np.asarray(logs.actions, np.float32), low, high)
+    empty = np.zeros((observations.shape[0], 0), np.float32)
+    return Rows(*(jnp.asarray(a) for a in (observations, empty, actions)))
+
+
+def train_denoiser(
+    train: Rows, held_out: Rows, config: DiffusionConfig, key: PRNGKeyArray, progress: Progress | None = None
+) -> tuple[Denoiser, dict[str, Any]]:
+    """Minimise Eq. 6 on `train`; returns the averaged weights that were best on `held_out`, and a summary."""
+    init_key, train_key, pick_key, validation_key = jax.random.split(key, 4)
+    state = init_state(train, config, init_key)
+    # A fixed random subset, in random order and with the same noise at every look: looks differ by the weights alone.
+    picked = jax.random.permutation(pick_key, held_out.actions.shape[0])[:VALIDATION_ROWS]
+    held_out = Rows(*(a[picked] for a in held_out))
+    best, best_loss, best_step, step, train_loss = state.ema, float("inf"), 0, 0, float("nan")
+    start = time.perf_counter()
+    while step < config.max_steps:
+        state, losses = train_chunk(state, train, held_out, train_key, validation_key, config)
+        step = int(state.step)
+        train_loss, validation_loss = (float(loss) for loss in losses)
+        if not (np.isfinite(train_loss) and np.isfinite(validation_loss)):
+            raise TrainingDiverged(f"fit of the prior: the denoising loss is not finite at step {step}")
+        if validation_loss < best_loss:
+            best, best_loss, best_step = state.ema, validation_loss, step
+        if progress is not None:
+            seconds = time.perf_counter() - start
+            progress(FitProgress(step, config.max_steps, train_loss, validation_loss, seconds))
+        if step - best_step >= config.patience * config.chunk_steps:
+            break
+    summary = {
+        "rows": train.actions.shape[0],
+        "steps": step,
+        "best_step": best_step,
+        "train_loss": train_loss,
+        "validation_loss": best_loss,
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+    return best, summary
+
+
+def init_state(rows: Rows, config: DiffusionConfig, key: PRNGKeyArray) -> FitState:
+    """A fresh denoiser with the rows' moments; a constant observation gets spread 1, so that it stays constant."""
+    std = np.std(np.asarray(rows.observations, np.float64), axis=0)
+    sigma_data = max(float(np.std(np.asarray(rows.actions, np.float64))), SMALLEST_SIGMA_DATA)
+    mean = np.mean(np.asarray(rows.observations, np.float64), axis=0)
+    denoiser = Denoiser.create(
+        key,
+        config,
+        jnp.asarray(mean, jnp.float32),
+        jnp.asarray(np.where(std > 1e-6, std, 1.0), jnp.float32),
+        jnp.asarray(sigma_data, jnp.float32),
+        rows.actions.shape[1],
+    )
+    return FitState(denoiser, denoiser, _optimizer(config).init(denoiser), jnp.zeros((), jnp.int32))
+
+
+def _optimizer(config: DiffusionConfig) -> Any:  # optax's own type knows no pytrees but arrays and dicts
+    warmup = min(config.warmup_steps, config.max_steps // 2)
+    schedule = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, config.max_steps)
+    return optax.chain(optax.clip_by_global_norm(10.0), optax.adam(schedule, b2=0.99))
+
+
+@partial(jax.jit, static_argnames="config")
+def train_chunk(
+    state: FitState,
+    train: Rows,
+    held_out: Rows,
+    train_key: PRNGKeyArray,
+    validation_key: PRNGKeyArray,
+    config: DiffusionConfig,
+) -> tuple[FitState, tuple[Float[Array, ""], Float[Array, ""]]]:
+    """`chunk_steps` steps as one program, then the mean training loss and the held-out loss of the averaged weights."""
+    optimizer = _optimizer(config)
+
+    def step(state: FitState, _):
+        row_key, noise_key = jax.random.split(jax.random.fold_in(train_key, state.step))
+        picked = jax.random.randint(row_key, (config.batch_size,), 0, train.actions.shape[0])
+        batch = Rows(*(a[picked] for a in train))
+        loss, gradient = jax.value_and_grad(denoising_loss)(state.denoiser, None, *batch, noise_key, config)
+        updates, moments = optimizer.update(gradient, state.optimizer)
+        denoiser = jax.tree.map(jnp.add, state.denoiser, updates)
+        # Early averages must not remember the random start.
+        decay = jnp.minimum(config.ema_decay, (1.0 + state.step) / (10.0 + state.step))
+        # Written as a step towards the weights, so that what does not change keeps its bits.
+        ema = jax.tree.map(lambda e, w: e + (1 - decay) * (w - e), state.ema, denoiser)
+        return FitState(denoiser, ema, moments, state.step + 1), loss
+
+    state, losses = jax.lax.scan(step, state, length=config.chunk_steps)
+    validation = denoising_loss(state.ema, None, *held_out, validation_key, config)
+    return state, (jnp.mean(losses), validation)

@@ -1,0 +1,133 @@
+"""Sampling from a denoiser: the stochastic solver of Eq. 8 and a second-order one that needs half the steps (4.7).
+
+Sizes: n states, k proposals a state, act action dimensions. A sampler knows no network: `denoise(x, sigma)` is the
+denoised action of x at noise level sigma, `drift(x, sigma)` the guidance term alpha_t grad Q of Eq. 8, already capped.
+All actions are scaled to [-1, 1]; denoised actions are clamped to that box, and so is the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ppo_dap.errors import unknown
+from ppo_dap.nets.adapters import Adapters, merge
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
+
+Field = Callable[[Array, Array], Array]
+"""A function of (x, sigma), shapes (n, k, act) and (), with the shape of x."""
+
+
+def karras_sigmas(num_steps: int, sigma_min: float, sigma_max: float, rho: float) -> Float[Array, " levels"]:
+    """Karras et al. (2022), Eq. 5: `num_steps` falling noise levels, then 0."""
+    ramp = jnp.linspace(1.0, 0.0, num_steps)
+    low, high = sigma_min ** (1 / rho), sigma_max ** (1 / rho)
+    return jnp.append((low + ramp * (high - low)) ** rho, 0.0)
+
+
+def ancestral(
+    denoise: Field,
+    sigmas: Float[Array, " levels"],
+    noise: Float[Array, "levels n k act"],
+    drift: Field | None = None,
+    displacement_cap: float | Float[Array, ""] | None = None,
+) -> tuple[Float[Array, "n k act"], Float[Array, "n k"]]:
+    """Equation 8: a_{t-1} = mu(a_t, s, t) + sigma_t z + alpha_t grad Q(s, a_t).
+
+    mu and sigma_t are mean and spread of the noisier action's exact step back, given its denoised value (DDPM's
+    posterior). Returns the actions and, per proposal, the summed norms of the guidance steps.
+    """
+    remaining = jnp.square(sigmas[1:] / sigmas[:-1])
+    spreads = sigmas[1:] * jnp.sqrt(1 - remaining)
+
+    def step(carry, inputs):
+        x, displacement = carry
+        sigma, share, spread, z = inputs
+        denoised = jnp.clip(denoise(x, sigma), -1.0, 1.0)
+        mean = denoised + share * (x - denoised)
+        return _guide(mean + spread * z, x, sigma, drift, displacement, displacement_cap), None
+
+    start = (sigmas[0] * noise[0], jnp.zeros(noise.shape[1:3], noise.dtype))
+    (x, displacement), _ = jax.lax.scan(step, start, (sigmas[:-1], remaining, spreads, noise[1:]))
+    return jnp.clip(x, -1.0, 1.0), displacement
+
+
+def dpmpp_2m(
+    denoise: Field,
+    sigmas: Float[Array, " levels"],
+    noise: Float[Array, "draws n k act"],
+    drift: Field | None = None,
+    displacement_cap: float | Float[Array, ""] | None = None,
+) -> tuple[Float[Array, "n k act"], Float[Array, "n k"]]:
+    """DPM-Solver++ 2M (Lu et al., 2022, Algorithm 2) with Eq. 8's guidance: deterministic after the start `noise[0]`.
+
+    Each step extrapolates the denoised action from the last two, which makes it second order in log(sigma).
+    """
+    log_sigmas = jnp.log(jnp.maximum(sigmas, jnp.finfo(sigmas.dtype).tiny))
+    steps = log_sigmas[:-1] - log_sigmas[1:]
+    # h_i / (2 h_{i-1}); a step without a predecessor or down to 0 noise stays first order.
+    slopes = jnp.concatenate([jnp.zeros(1), steps[1:] / (2 * steps[:-1])])
+    slopes = jnp.where(sigmas[1:] > 0, slopes, 0.0)
+
+    def step(carry, inputs):
+        x, displacement, previous = carry
+        sigma, ratio, slope = inputs
+        denoised = jnp.clip(denoise(x, sigma), -1.0, 1.0)
+        target = denoised + slope * (denoised - previous)
+        moved = _guide(target + ratio * (x - target), x, sigma, drift, displacement, displacement_cap)
+        return (*moved, denoised), None
+
+    start = (sigmas[0] * noise[0], jnp.zeros(noise.shape[1:3], noise.dtype), jnp.zeros_like(noise[0]))
+    (x, displacement, _), _ = jax.lax.scan(step, start, (sigmas[:-1], sigmas[1:] / sigmas[:-1], slopes))
+    return jnp.clip(x, -1.0, 1.0), displacement
+
+
+def _guide(stepped, x, sigma, drift, displacement, cap):
+    """Add the guidance at x to the sampler's own step, shortened so that its total norm stays within `cap`."""
+    if drift is None:
+        return stepped, displacement
+    push = drift(x, sigma)
+    norm = jnp.sqrt(jnp.sum(jnp.square(push), axis=-1))
+    if cap is not None:
+        allowed = jnp.clip(cap - displacement, 0.0, norm)
+        push = push * (allowed / jnp.maximum(norm, jnp.finfo(norm.dtype).tiny))[..., None]
+        norm = allowed
+    return stepped + push, displacement + norm
+
+
+SAMPLERS = {"ancestral": ancestral, "dpmpp_2m": dpmpp_2m}
+
+
+def sample_actions(
+    denoiser: Denoiser,
+    adapters: Adapters | None,
+    observations: Float[Array, "n obs"],
+    condition: Float[Array, "n c"],
+    key: PRNGKeyArray,
+    num: int,
+    config: DiffusionConfig,
+    *,
+    sampler: str | None = None,
+    num_steps: int | None = None,
+    drift: Field | None = None,
+    displacement_cap: float | Float[Array, ""] | None = None,
+) -> tuple[Float[Array, "n {num} act"], Float[Array, "n {num}"]]:
+    """`num` actions a state, and how far guidance moved each; sampler and steps are the config's unless given."""
+    sampler = config.sampler if sampler is None else sampler
+    if sampler not in SAMPLERS:
+        raise unknown("sampler", sampler, SAMPLERS)
+    num_steps = config.sampler_steps if num_steps is None else num_steps
+    denoiser, adapters = merge(denoiser, adapters)
+    embedding = denoiser.embed(observations, condition)
+    sigmas = karras_sigmas(num_steps, config.sigma_min, config.sigma_max, config.rho)
+    # All noise in one draw outside the loop; the deterministic sampler needs only its start.
+    draws = num_steps + 1 if sampler == "ancestral" else 1
+    noise = jax.random.normal(key, (draws, observations.shape[0], num, denoiser.out.weight.shape[0]))
+
+    def denoise(x, sigma):
+        return denoiser(x, embedding, sigma, adapters)
+
+    return SAMPLERS[sampler](denoise, sigmas, noise, drift, displacement_cap)

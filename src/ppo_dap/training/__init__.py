@@ -1,0 +1,1 @@
+"""Stage II: Algorithm 1, and what makes a run of it: warm start, evaluation, checkpoints, recording."""

@@ -1,0 +1,216 @@
+"""The public way into Stage II: `train` makes or resumes a run folder, `load_run` opens one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ppo_dap import config as configs
+from ppo_dap.config import Config
+from ppo_dap.dap import audit
+from ppo_dap.errors import InputError
+from ppo_dap.logs import Logs, load_logs, require_compatible
+from ppo_dap.methods import Method, get_method, resolve
+from ppo_dap.nets.normalizer import RewardScale, RunningMoments
+from ppo_dap.nets.policy import Policy, load_policy
+from ppo_dap.nets.storage import write_atomically
+from ppo_dap.priors.prior import DiffusionPrior, load_prior
+from ppo_dap.tasks import TaskSpec, describe
+from ppo_dap.training.algorithm import Frozen, Stages, create_learner
+from ppo_dap.training.manifest import manifest
+from ppo_dap.training.proof import prove
+from ppo_dap.training.recording import Recorder, make_progress, read_table
+from ppo_dap.training.state import TrainState, load_checkpoint
+from ppo_dap.training.trainer import Trainer
+from ppo_dap.training.warm_start import warm_start
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder."""
+
+    folder: Path
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """`config.json`: the resolved settings and the manifest."""
+        return json.loads((self.folder / "config.json").read_text())
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy at the run's end: numpy in, numpy out, deterministic, the normaliser inside."""
+        return load_policy(self.folder / "policy.safetensors")
+
+    @property
+    def metrics(self) -> list[dict[str, Any]]:
+        """One row an iteration."""
+        return read_table(self.folder, "metrics")
+
+    @property
+    def evaluations(self) -> list[dict[str, Any]]:
+        """One row an evaluation point."""
+        return read_table(self.folder, "evaluations")
+
+    def audit(self) -> list[audit.Claim]:
+        """Definition 1, claim by claim: proved on the traced update, and measured in every iteration so far."""
+        path = self.folder / "audit.json"
+        if not path.is_file():
+            raise InputError(f"{self.folder} has no audit.json: is it a run folder?")
+        static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
+        return static + audit.measured_claims(self.metrics)
+
+
+def load_run(folder: str | Path) -> Run:
+    """Open a run folder; raises `InputError` if it is none."""
+    folder = Path(folder)
+    if not (folder / "config.json").is_file():
+        raise InputError(f"{folder} is not a run folder: it has no config.json")
+    return Run(folder)
+
+
+def train(
+    task: str,
+    method: str = "ppo-dap",
+    *,
+    prior: DiffusionPrior | str | Path | None = None,
+    logs: Logs | str | Path | None = None,
+    out: str | Path,
+    preset: str = "paper",
+    resume: bool = False,
+    progress: bool = True,
+    **options: Any,
+) -> Run:
+    """Train `method` on `task` and write everything to the run folder `out`.
+
+    `prior` is needed by methods that have one, `logs` by a warm start; `options` are fields of `Config` by name. With
+    `resume` the run in `out` goes on from its last checkpoint, under the config that it was started with.
+
+    Raises `InputError` for anything that cannot work, before anything is written.
+    """
+    chosen = get_method(method)
+    config = resolve(chosen, configs.make(preset, **options), options)
+    if chosen.needs_logs and config.warm.warm_start == "none":
+        config = configs.replace(config, warm_start="actor")
+    folder = Path(out)
+    spec = describe(task)
+    prior = _check_prior(chosen, prior, spec)
+    logs = _check_logs(config, logs, spec)
+    description = {
+        "task": task,
+        "method": chosen.name,
+        "preset": preset,
+        "config": configs.flatten(config),
+        "prior_hash": None if prior is None else prior.logs_hash,
+        "logs_hash": None if logs is None else logs.hash(),
+    }
+    _check_folder(folder, description, resume)
+    trainer = _make_trainer(config, spec, prior, logs, folder, description, resume, progress)
+    trainer.run()
+    return Run(folder)
+
+
+def _make_trainer(
+    config: Config,
+    spec: TaskSpec,
+    prior: DiffusionPrior | None,
+    logs: Logs | None,
+    folder: Path,
+    description: dict[str, Any],
+    resume: bool,
+    show: bool,
+) -> Trainer:
+    sizes = (spec.observation_size, spec.action_size)
+    frozen, diffusion = None, None
+    if prior is not None:
+        diffusion = prior.config
+        frozen = Frozen(prior.denoiser, audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions)))
+    learner = create_learner(
+        jax.random.key(config.run.seed), sizes, config, None if frozen is None else frozen.denoiser
+    )
+    state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
+    lines = None
+    checkpoint = folder / "checkpoints" / "last.safetensors"
+    if resume and checkpoint.is_file():
+        state, run = load_checkpoint(checkpoint, state)
+        lines = run["lines"]
+    elif logs is not None:
+        state = warm_start(state, logs, spec, config)
+    stages = Stages(config, diffusion)
+    claims = prove(learner, frozen, config, stages)
+    if lines is None:
+        write_atomically(folder / "config.json", json.dumps(description | manifest(), indent=1).encode())
+    recorder = Recorder(folder, config.run.tensorboard, lines)
+    label = f"{spec.task} {description['method']} seed {config.run.seed}"
+    bar = make_progress(label, config.run.steps, state.env_steps, show)
+    return Trainer(config, spec, state, frozen, stages, folder, {"task": spec.task}, claims, recorder, bar)
+
+
+def _check_prior(method: Method, prior: Any, spec: TaskSpec) -> DiffusionPrior | None:
+    if method.prior == "none":
+        if prior is not None:
+            raise InputError(f"method {method.name} has no prior, but prior {prior} was given: leave it out")
+        return None
+    if prior is None:
+        raise InputError(f"method {method.name} needs a prior: fit one with `ppo-dap pretrain` and pass it as prior")
+    prior = prior if isinstance(prior, DiffusionPrior) else load_prior(prior)
+    for name in ("observation_size", "action_size"):
+        if getattr(prior, name) != getattr(spec, name):
+            raise InputError(
+                f"the prior was fitted to logs of {prior.task or 'another task'} with {name} {getattr(prior, name)}; "
+                f"{spec.task} has {name} {getattr(spec, name)}: fit a prior to logs of {spec.task}"
+            )
+    if prior.task is not None and prior.task.split("-v")[0] != spec.task.split("-v")[0]:
+        raise InputError(f"the prior was fitted to logs of {prior.task}, not of {spec.task}")
+    if not (np.allclose(prior.action_low, spec.action_low) and np.allclose(prior.action_high, spec.action_high)):
+        raise InputError(
+            f"the prior's action bounds {prior.action_low}..{prior.action_high} are not those of {spec.task}, "
+            f"{spec.action_low}..{spec.action_high}"
+        )
+    return prior
+
+
+def _check_logs(config: Config, logs: Any, spec: TaskSpec) -> Logs | None:
+    if config.warm.warm_start == "none":
+        if logs is not None:
+            raise InputError("logs are used by a warm start alone: set warm_start, or leave logs out")
+        return None
+    if logs is None:
+        raise InputError(f"warm_start {config.warm.warm_start!r} needs logs")
+    logs = logs if isinstance(logs, Logs) else load_logs(logs)
+    require_compatible(
+        logs, task=spec.task, observation_size=spec.observation_size, action_size=spec.action_size
+    )
+    return logs
+
+
+def _check_folder(folder: Path, description: dict[str, Any], resume: bool) -> None:
+    """Refuse to write over a run, and to resume one as another."""
+    path = folder / "config.json"
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"out {folder} is a file: name a folder")
+    if not path.is_file():
+        if resume:
+            raise InputError(f"nothing to resume in {folder}: it has no config.json")
+        if folder.is_dir() and any(folder.iterdir()):
+            raise InputError(f"out {folder} is a folder with other files in it: name a new one")
+        return
+    if not resume:
+        raise InputError(f"out {folder} holds a run already: name a new folder, or resume it")
+    stored = json.loads(path.read_text())
+    for name, value in description.items():
+        if name == "config":
+            for option, wanted in value.items():
+                if stored["config"].get(option) != wanted:
+                    raise InputError(
+                        f"cannot resume {folder} with {option} {wanted!r}: it was started with "
+                        f"{stored['config'].get(option)!r}"
+                    )
+        elif stored.get(name) != value:
+            raise InputError(f"cannot resume {folder} with {name} {value!r}: it was started with {stored.get(name)!r}")

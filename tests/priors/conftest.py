@@ -1,0 +1,52 @@
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # for `truths`
+
+from truths import TwoModes
+
+from ppo_dap.logs import Logs
+from ppo_dap.priors.fit import Rows, fit_prior, train_denoiser
+
+SMALL = {"width": 64, "depth": 1, "batch_size": 256, "max_steps": 2000, "chunk_steps": 250, "ema_decay": 0.99}
+
+
+def two_mode_logs(rows=20_000, **fields):
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (rows, 2))
+    actions = TwoModes().sample(states, 1, rng)[:, 0]
+    bounds = {"action_low": np.array([-2.0, 0.0]), "action_high": np.array([2.0, 1.0])}
+    # The environment's units: the first dimension in [-2, 2], the second in [0, 1].
+    units = actions * np.array([2.0, 0.5]) + np.array([0.0, 0.5])
+    ends = np.arange(1, rows + 1) % 100 == 0
+    return Logs(observations=states, actions=units, episode_ends=ends, **{**bounds, "task": "Toy-v0", **fields})
+
+
+@pytest.fixture(scope="session")
+def logs():
+    return two_mode_logs()
+
+
+@pytest.fixture(scope="session")
+def prior(logs):
+    return fit_prior(logs, seed=3, **SMALL)
+
+
+@pytest.fixture(scope="session")
+def labelled():
+    """A denoiser fitted to actions near -0.5 under the label -1 and near 0.5 under the label 1."""
+    from ppo_dap.priors.diffusion import DiffusionConfig
+
+    rng = np.random.default_rng(1)
+    label = rng.choice([-1.0, 1.0], (8000, 1))
+    actions = 0.5 * label + 0.1 * rng.standard_normal((8000, 1))
+    rows = Rows(*(jnp.asarray(a, jnp.float32) for a in (rng.standard_normal((8000, 2)), label, actions)))
+    config = DiffusionConfig(**{**SMALL, "width": 32, "max_steps": 600, "chunk_steps": 200}, num_conditions=1)
+    held_out = Rows(*(a[7000:] for a in rows))
+    denoiser, _ = train_denoiser(Rows(*(a[:7000] for a in rows)), held_out, config, jax.random.key(0))
+    return denoiser, config

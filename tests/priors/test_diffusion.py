@@ -1,0 +1,139 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from ppo_dap.errors import InputError
+from ppo_dap.nets.mlp import Linear
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, denoising_loss, draw_sigmas
+from ppo_dap.priors.fit import Rows, train_denoiser
+from ppo_dap.priors.samplers import sample_actions
+
+SD = 0.2
+
+
+def zero_output(config, sigma_data, action_size=3):
+    """A denoiser whose network says 0, so that D(x; sigma) = c_skip x: Bayes-optimal for N(0, sigma_data^2) data."""
+    moments = jnp.zeros(2), jnp.ones(2), jnp.asarray(sigma_data)
+    denoiser = Denoiser.create(jax.random.key(0), config, *moments, action_size)
+    silent = Linear(jnp.zeros_like(denoiser.out.weight), jnp.zeros_like(denoiser.out.bias))
+    return Denoiser(**{**vars(denoiser), "out": silent})
+
+
+def loss_of_silent_network(rows=200_000, **options):
+    config = DiffusionConfig(width=4, depth=1, **options)
+    actions = SD * jax.random.normal(jax.random.key(5), (rows, 3))
+    inputs = jnp.zeros((rows, 2)), jnp.zeros((rows, 0)), actions
+    return float(denoising_loss(zero_output(config, SD), None, *inputs, jax.random.key(6), config))
+
+
+def test_edm_weighting_makes_every_level_count_one_per_dimension():
+    """The posterior variance sd^2 sigma^2 / (sd^2 + sigma^2) is the inverse of the weight: 3 dimensions give 3."""
+    assert loss_of_silent_network() == pytest.approx(3.0, rel=0.01)
+    assert loss_of_silent_network(noise_distribution="loguniform") == pytest.approx(3.0, rel=0.01)
+
+
+def test_equation_6_as_printed_has_its_closed_form():
+    """The mean of sd^2 sigma^2 / (sd^2 + sigma^2) over log-uniform sigma, integrated by hand."""
+    low, high = 0.05, 2.0
+    options = {"loss_weighting": "none", "noise_distribution": "loguniform", "sigma_min": low, "sigma_max": high}
+    mean = SD**2 * np.log((high**2 + SD**2) / (low**2 + SD**2)) / (2 * np.log(high / low))
+    assert loss_of_silent_network(**options) == pytest.approx(3 * mean, rel=0.01)
+
+
+def test_sigmas_follow_their_distribution():
+    def draw(**options):
+        config = DiffusionConfig(sigma_min=0.01, sigma_max=10.0, **options)
+        return np.log(np.asarray(draw_sigmas(jax.random.key(0), 4000, jnp.asarray(0.5), config), np.float64))
+
+    uniform = stats.uniform(np.log(0.01), np.log(1000))
+    assert stats.kstest(draw(noise_distribution="loguniform"), uniform.cdf).pvalue > 0.05
+    inner = draw(noise_distribution="lognormal")
+    # Karras et al.'s N(-1.2, 1.2^2) for data of spread 0.5.
+    assert stats.kstest(inner[np.abs(inner) < 4.5], stats.norm(-1.193, 1.2).cdf).pvalue > 0.05
+
+
+@pytest.fixture(scope="module")
+def gaussian_fit():
+    """A denoiser fitted to a ~ N(m(s), SD^2) with m(s) = 0.3 sin(2 s), well inside the box."""
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (20_000, 1))
+    actions = 0.3 * np.sin(2 * states) + SD * rng.standard_normal(states.shape)
+    rows = Rows(*(jnp.asarray(a, jnp.float32) for a in (states, np.zeros((len(states), 0)), actions)))
+    config = DiffusionConfig(width=64, depth=1, batch_size=512, max_steps=1500, chunk_steps=300, ema_decay=0.995)
+    held_out = Rows(*(a[18_000:] for a in rows))
+    denoiser, _ = train_denoiser(Rows(*(a[:18_000] for a in rows)), held_out, config, jax.random.key(0))
+    return denoiser, config
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.2, 0.7, 3.0])
+def test_fitted_denoiser_is_the_posterior_mean(gaussian_fit, sigma):
+    denoiser, _ = gaussian_fit
+    rng = np.random.default_rng(1)
+    states = rng.uniform(-0.9, 0.9, (100, 1)).astype(np.float32)
+    mean = 0.3 * np.sin(2 * states)[:, None]
+    x = (mean + np.hypot(SD, sigma) * rng.standard_normal((100, 8, 1))).astype(np.float32)
+    embedding = denoiser.embed(jnp.asarray(states), jnp.zeros((100, 0)))
+    denoised = np.asarray(denoiser(jnp.asarray(x), embedding, jnp.asarray(sigma, jnp.float32)))
+    exact = (SD**2 * x + sigma**2 * mean) / (SD**2 + sigma**2)
+    error = np.sqrt(np.mean((denoised - exact) ** 2))
+    assert error < 0.1 * SD
+    # What ignores the state, or the noisy action, is far off at the levels where that matters.
+    ignorant = SD**2 * x / (SD**2 + sigma**2) if sigma > SD else mean
+    assert error < 0.4 * np.sqrt(np.mean((ignorant - exact) ** 2))
+
+
+def test_a_level_for_each_action_equals_one_level_for_all(gaussian_fit):
+    denoiser, _ = gaussian_fit
+    x = jax.random.normal(jax.random.key(0), (5, 4, 1))
+    embedding = denoiser.embed(jnp.ones((5, 1)) * 0.3, jnp.zeros((5, 0)))
+    one = denoiser(x, embedding, jnp.asarray(0.4))
+    np.testing.assert_allclose(denoiser(x, embedding, jnp.full((5, 4), 0.4)), one, rtol=1e-5, atol=1e-6)
+
+
+def test_observations_are_normalised_and_clipped():
+    config = DiffusionConfig(width=8, depth=1)
+    denoiser = Denoiser.create(jax.random.key(0), config, jnp.asarray([5.0]), jnp.asarray([2.0]), jnp.asarray(0.5), 1)
+    none = jnp.zeros((1, 0))
+    np.testing.assert_array_equal(
+        denoiser.embed(jnp.asarray([[25.0]]), none), denoiser.embed(jnp.asarray([[1e6]]), none)
+    )
+    assert np.any(denoiser.embed(jnp.asarray([[24.0]]), none) != denoiser.embed(jnp.asarray([[25.0]]), none))
+
+
+def test_moments_of_the_logs_do_not_move(gaussian_fit):
+    denoiser, config = gaussian_fit
+    inputs = jnp.ones((8, 1)), jnp.zeros((8, 0)), jnp.ones((8, 1))
+    gradient = jax.grad(denoising_loss)(denoiser, None, *inputs, jax.random.key(0), config)
+    assert float(gradient.sigma_data) == 0
+    assert not np.any(gradient.observation_mean)
+    assert not np.any(gradient.observation_std)
+    assert np.any(gradient.out.weight)
+
+
+def test_condition_conditions(labelled):
+    denoiser, config = labelled
+    for label in (-1.0, 1.0):
+        condition = jnp.full((50, 1), label)
+        actions, _ = sample_actions(denoiser, None, jnp.zeros((50, 2)), condition, jax.random.key(0), 20, config)
+        assert float(jnp.mean(actions)) == pytest.approx(0.5 * label, abs=0.03)
+        assert float(jnp.std(actions)) == pytest.approx(0.1, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"noise_distribution": "log-normal"}, "did you mean 'lognormal'"),
+        ({"width": 0}, "width must be"),
+        ({"max_steps": -1}, "max_steps must be"),
+        ({"sigma_min": 6.0}, "must be below sigma_max"),
+        ({"sigma_max": float("nan")}, "sigma_max must be"),
+        ({"validation_fraction": 1.5}, "below 1"),
+        ({"width": "64"}, "width must be"),
+        ({"depth": 1.5}, "depth must be"),
+    ],
+)
+def test_impossible_settings_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        DiffusionConfig(**options)

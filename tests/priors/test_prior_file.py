@@ -1,0 +1,112 @@
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from ppo_dap.errors import InputError
+from ppo_dap.priors.prior import Prior, load_prior
+
+
+def saved(prior, folder):
+    path = folder / "prior"
+    prior.save(path)
+    return path
+
+
+def rewritten(path, change_metadata=None, drop=None):
+    """The file with its metadata changed or with an array dropped."""
+    with safetensors.safe_open(path, framework="numpy") as file:
+        metadata = file.metadata()
+    tensors = safetensors.numpy.load(path.read_bytes())
+    tensors.pop(drop, None)
+    path.write_bytes(safetensors.numpy.save(tensors, {**metadata, **(change_metadata or {})}))
+    return path
+
+
+def test_a_loaded_prior_is_the_same_prior(prior, tmp_path):
+    loaded = load_prior(saved(prior, tmp_path))
+    assert isinstance(loaded, Prior)
+    states = np.random.default_rng(0).standard_normal((7, 2))
+    np.testing.assert_array_equal(
+        loaded.sample(states, jax.random.key(1), 5), prior.sample(states, jax.random.key(1), 5)
+    )
+    for field in dataclasses.fields(prior):
+        if field.name != "denoiser":
+            np.testing.assert_equal(getattr(loaded, field.name), getattr(prior, field.name))
+
+
+def test_save_writes_exactly_the_path_and_nothing_else(prior, tmp_path):
+    path = saved(prior, tmp_path / "new" / "folder")
+    first = path.read_bytes()
+    prior.save(str(path))
+    assert path.read_bytes() == first
+    assert [p.name for p in path.parent.iterdir()] == ["prior"]
+
+
+def test_a_failed_save_leaves_the_old_file(prior, tmp_path, monkeypatch):
+    path = saved(prior, tmp_path)
+    first = path.read_bytes()
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(InputError, match="cannot write prior .*: No space left on device"):
+        prior.save(path)
+    assert path.read_bytes() == first
+    assert [p.name for p in tmp_path.iterdir()] == ["prior"]
+
+
+def refuse(path, message):
+    with pytest.raises(InputError, match=message) as caught:
+        load_prior(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_file_and_folder(tmp_path):
+    refuse(tmp_path / "none", "no such file")
+    refuse(tmp_path, "it is a folder")
+
+
+def test_damaged_files(prior, tmp_path):
+    path = saved(prior, tmp_path)
+    whole = path.read_bytes()
+    for size in (0, 5, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        refuse(path, "damaged or not a prior")
+    path.write_text("not a prior at all, just some text that goes on for a while")
+    refuse(path, "damaged or not a prior")
+
+
+def test_other_safetensors_file(tmp_path):
+    path = tmp_path / "other.safetensors"
+    path.write_bytes(safetensors.numpy.save({"a": np.zeros(3)}))
+    refuse(path, "not a prior: write one with")
+
+
+def test_newer_format(prior, tmp_path):
+    refuse(rewritten(saved(prior, tmp_path), {"version": "99"}), "format 99")
+
+
+def test_missing_or_misshapen_arrays(prior, tmp_path):
+    refuse(rewritten(saved(prior, tmp_path), drop="denoiser.out.weight"), "denoiser.out.weight should have shape")
+    refuse(rewritten(saved(prior, tmp_path), drop="action_low"), "action_low is missing")
+
+
+def test_unreadable_header(prior, tmp_path):
+    refuse(rewritten(saved(prior, tmp_path), {"prior": "{"}), "damaged")
+    refuse(rewritten(saved(prior, tmp_path), {"version": "one"}), "damaged")
+    header = json.dumps({"kind": "diffusion"})
+    refuse(rewritten(saved(prior, tmp_path), {"prior": header}), "damaged")
+    refuse(rewritten(saved(prior, tmp_path), {"prior": json.dumps({"kind": "oracle"})}), "unknown prior kind 'oracle'")
+
+
+def test_wrong_sizes_are_refused(prior):
+    with pytest.raises(InputError, match="observations have 3 numbers, the prior's 2"):
+        prior.sample(np.zeros((4, 3)), jax.random.key(0), 2)
+    with pytest.raises(InputError, match="condition has 1 numbers, the prior's 0"):
+        prior.sample(np.zeros((4, 2)), jax.random.key(0), 2, np.zeros((4, 1)))

@@ -1,0 +1,130 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import SMALL, two_mode_logs
+from truths import TwoModes, energy, moment_matched
+
+from ppo_dap.errors import InputError, TrainingDiverged
+from ppo_dap.priors import fit
+from ppo_dap.priors.diffusion import DiffusionConfig
+from ppo_dap.priors.fit import Rows, fit_prior, train_denoiser
+
+QUICK = {"width": 8, "depth": 1, "batch_size": 32, "max_steps": 20, "chunk_steps": 10}
+
+
+def in_scaled_units(actions):
+    return (np.asarray(actions, np.float64) - [0.0, 0.5]) / [2.0, 0.5]
+
+
+@pytest.mark.parametrize("sampler", ["ancestral", "dpmpp_2m"])
+def test_fitted_prior_has_the_distribution_of_the_logs(prior, sampler):
+    import dataclasses
+
+    states = np.array([[0.3, -0.6], [-0.5, 0.5], [0.8, 0.1]])
+    chosen = dataclasses.replace(prior, config=dataclasses.replace(prior.config, sampler=sampler))
+    samples = in_scaled_units(chosen.sample(states, jax.random.key(0), 1000))
+    truths = TwoModes().sample(states, 1000, np.random.default_rng(5))
+    for x, truth in zip(samples, truths, strict=True):
+        assert np.mean(x[:, 0] > 0) == pytest.approx(0.3, abs=0.06)
+        assert energy(x, truth) < 0.1 * energy(moment_matched(truth, np.random.default_rng(6)), truth)
+
+
+def test_fit_knows_its_logs(prior, logs):
+    assert (prior.kind, prior.observation_size, prior.action_size, prior.task) == ("diffusion", 2, 2, "Toy-v0")
+    assert prior.logs_hash == logs.hash()
+    assert float(prior.denoiser.sigma_data) == pytest.approx(np.std(in_scaled_units(logs.actions)), rel=0.01)
+    assert prior.training["steps"] >= prior.training["best_step"] > 0
+    known = {tuple(row) for row in np.asarray(logs.observations)}
+    assert len(prior.probe_observations) == 256
+    assert all(tuple(row) in known for row in prior.probe_observations)
+    assert np.abs(prior.probe_actions).max() <= 1
+
+
+def test_samples_are_within_the_bounds(prior):
+    actions = np.asarray(prior.sample(np.full((20, 2), 50.0), jax.random.key(0), 30))
+    assert actions.shape == (20, 30, 2)
+    assert np.all(actions >= [-2.0, 0.0])
+    assert np.all(actions <= [2.0, 1.0])
+
+
+def test_same_seed_same_bits(logs):
+    first, again, other = (fit_prior(logs, seed=seed, **QUICK) for seed in (1, 1, 2))
+    weights = [jax.tree.leaves(p.denoiser) for p in (first, again, other)]
+    assert all(np.array_equal(a, b) for a, b in zip(weights[0], weights[1], strict=True))
+    assert not np.array_equal(first.denoiser.out.weight, other.denoiser.out.weight)
+
+
+def test_progress_is_told_of_every_chunk(logs):
+    seen = []
+    fit_prior(logs, progress=seen.append, **QUICK)
+    assert [p.step for p in seen] == [10, 20]
+    assert all(p.max_steps == 20 and np.isfinite(p.train_loss) and np.isfinite(p.validation_loss) for p in seen)
+    assert 0 <= seen[0].seconds <= seen[1].seconds
+
+
+def scripted(monkeypatch, losses):
+    """Let the held-out loss follow a script; the averaged weights carry the number of their look."""
+    calls = []
+
+    def chunk(state, train, held_out, train_key, validation_key, config):
+        look = len(calls)
+        calls.append((held_out, validation_key))
+        marked = fit.Denoiser(**{**vars(state.ema), "sigma_data": jnp.asarray(float(look))})
+        state = state._replace(ema=marked, step=state.step + config.chunk_steps)
+        return state, (jnp.asarray(1.0), jnp.asarray(losses[look]))
+
+    monkeypatch.setattr(fit, "train_chunk", chunk)
+    rows = Rows(jnp.ones((40, 1)), jnp.zeros((40, 0)), jnp.ones((40, 1)))
+    config = DiffusionConfig(**{**QUICK, "max_steps": 80}, patience=3)
+    return train_denoiser(rows, rows, config, jax.random.key(0)), calls
+
+
+def test_early_stopping_keeps_the_best(monkeypatch):
+    (denoiser, summary), calls = scripted(monkeypatch, [3.0, 2.0, 1.0, 1.5, 1.0, 1.2, 0.1, 0.1])
+    assert float(denoiser.sigma_data) == 2  # the third look
+    assert (summary["best_step"], summary["steps"], summary["validation_loss"]) == (30, 60, 1.0)
+    for held_out, key in calls:  # the same rows and the same noise at every look
+        assert held_out is calls[0][0]
+        assert key is calls[0][1]
+
+
+def test_a_fit_that_diverges_says_when(monkeypatch):
+    with pytest.raises(TrainingDiverged, match="not finite at step 20"):
+        scripted(monkeypatch, [1.0, float("nan")])
+
+
+def test_constant_observations_and_actions_outside_the_bounds():
+    rng = np.random.default_rng(0)
+    states = np.stack([rng.standard_normal(200), np.full(200, 7.0)], axis=1)
+    logs = two_mode_logs(200, observations=states, actions=rng.uniform(-9, 9, (200, 2)))
+    prior = fit_prior(logs, **QUICK)
+    np.testing.assert_allclose(prior.denoiser.observation_mean[1], 7.0)
+    assert float(prior.denoiser.observation_std[1]) == 1.0
+    assert np.abs(prior.probe_actions).max() == 1.0
+    assert np.all(np.isfinite(prior.sample(states[:4], jax.random.key(0), 3)))
+
+
+def test_bounds_from_the_options():
+    logs = two_mode_logs(200, action_low=None, action_high=None)
+    with pytest.raises(InputError, match="pass action_low and action_high"):
+        fit_prior(logs, **QUICK)
+    prior = fit_prior(logs, action_low=-3.0, action_high=[3.0, 2.0], **QUICK)
+    np.testing.assert_array_equal(prior.action_low, [-3.0, -3.0])
+    np.testing.assert_array_equal(prior.action_high, [3.0, 2.0])
+    for low, high in ((-np.inf, 1.0), (1.0, -1.0), ([0.0, 0.0, 0.0], 1.0)):
+        with pytest.raises(InputError, match="action_low"):
+            fit_prior(logs, action_low=low, action_high=high, **QUICK)
+
+
+def test_unknown_names_are_refused(logs):
+    with pytest.raises(InputError, match="unknown prior kind 'difusion': did you mean 'diffusion'"):
+        fit_prior(logs, kind="difusion")
+    with pytest.raises(InputError, match="did you mean 'learning_rate'"):
+        fit_prior(logs, lerning_rate=1e-3)
+    with pytest.raises(InputError, match="num_conditions must be 0"):
+        fit_prior(logs, num_conditions=1)
+
+
+def test_small_fixture_settings_are_valid():
+    DiffusionConfig(**SMALL)
