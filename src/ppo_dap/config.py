@@ -220,16 +220,13 @@ _at_least_0 = (lambda v: v >= 0, "a number of 0 or more")
 _share = (lambda v: 0 < v <= 1, "a number above 0 and at most 1")
 _RULES: dict[str, tuple[Any, str]] = {
     **dict.fromkeys(
-        "num_envs rollout_steps minibatch_size num_epochs hidden_size num_proposals sampler_steps q_hidden_size q_epochs "
-        "pet_minibatch_size adapter_rank warm_start_epochs steps eval_episodes checkpoint_every threads learning_rate "
-        "max_grad_norm kl_target observation_clip reward_clip guidance_cap proxy_std_floor q_learning_rate "
-        "pet_learning_rate warm_start_std_floor clip_epsilon".split(),
+        ["num_envs", "rollout_steps", "minibatch_size", "num_epochs", "hidden_size", "num_proposals", "sampler_steps", "q_hidden_size", "q_epochs", "pet_minibatch_size", "adapter_rank", "warm_start_epochs", "steps", "eval_episodes", "checkpoint_every", "threads", "learning_rate", "max_grad_norm", "kl_target", "observation_clip", "reward_clip", "guidance_cap", "proxy_std_floor", "q_learning_rate", "pet_learning_rate", "warm_start_std_floor", "clip_epsilon"],
         _positive,
     ),
     **dict.fromkeys(
-        "value_coefficient beta_max alpha_max lambda_kl lambda_aux pet_frequency eval_every seed".split(), _at_least_0
+        ["value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every", "seed"], _at_least_0
     ),
-    **dict.fromkeys("proposal_fraction beta_anneal".split(), _share),
+    **dict.fromkeys(["proposal_fraction", "beta_anneal"], _share),
     **dict.fromkeys(("gamma", "gae_lambda"), (lambda v: 0 <= v <= 1, "a number from 0 to 1")),
     **dict.fromkeys(("displacement_cap", "top_k"), (lambda v: v is None or v > 0, "a number above 0, or None")),
     "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),
@@ -259,10 +256,9 @@ def _validate_field(name: str, value: Any, hint: Any) -> None:
             raise unknown(f"value of {name}", value, typing.get_args(hint))
         return
     allowed = typing.get_args(hint) or (hint,)
-    right_type = (
-        isinstance(value, allowed)
-        or (float in allowed and isinstance(value, int))
-    ) and (bool in allowed or not isinstance(value, bool))
+    right_type = (isinstance(value, allowed) or (float in allowed and isinstance(value, int))) and (
+        bool in allowed or not isinstance(value, bool)
+    )
     if not right_type:
         kinds = " or ".join("None" if t is type(None) else t.__name__ for t in allowed)
         raise InputError(f"{name} must be {kinds}, not {value!r}")

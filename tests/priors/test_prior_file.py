@@ -54,7 +54,7 @@ def test_a_failed_save_leaves_the_old_file(prior, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(InputError, match="cannot write prior .*: No space left on device"):
+    with pytest.raises(InputError, match=r"cannot write prior .*: No space left on device"):
         prior.save(path)
     assert path.read_bytes() == first
     assert [p.name for p in tmp_path.iterdir()] == ["prior"]

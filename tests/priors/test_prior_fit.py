@@ -2,9 +2,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SMALL, two_mode_logs
 from truths import TwoModes, energy, moment_matched
 
+from conftest import SMALL, two_mode_logs
 from ppo_dap.errors import InputError, TrainingDiverged
 from ppo_dap.priors import fit
 from ppo_dap.priors.diffusion import DiffusionConfig

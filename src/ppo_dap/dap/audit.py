@@ -162,10 +162,34 @@ class Claim:
 
 FORBIDDEN: tuple[tuple[str, str, str, str, frozenset[str]], ...] = (
     # clause, statement, which flow, output or tag, labels that must not reach it
-    ("(i)", "the importance ratio is made of theta and D_on", "cut", "tag:ratio", frozenset({"proposals", "offline", "backbone", "adapters", "q"})),
-    ("(i)", "the advantages are made of V and D_on", "full", "tag:advantages", frozenset({"proposals", "offline", "backbone", "adapters", "q"})),
-    ("(i)", "V and its trunk learn from D_on alone, not from Q or proposals", "full", "out:critic", frozenset({"proposals", "offline", "backbone", "adapters", "q"})),
-    ("(iii)", "PET's gradient is made of D_on and the prior, not of actor, critic, Q, proposals or logs", "full", "out:adapters", frozenset({"proposals", "offline", "actor", "critic", "q", "ppo_optimizers"})),
+    (
+        "(i)",
+        "the importance ratio is made of theta and D_on",
+        "cut",
+        "tag:ratio",
+        frozenset({"proposals", "offline", "backbone", "adapters", "q"}),
+    ),
+    (
+        "(i)",
+        "the advantages are made of V and D_on",
+        "full",
+        "tag:advantages",
+        frozenset({"proposals", "offline", "backbone", "adapters", "q"}),
+    ),
+    (
+        "(i)",
+        "V and its trunk learn from D_on alone, not from Q or proposals",
+        "full",
+        "out:critic",
+        frozenset({"proposals", "offline", "backbone", "adapters", "q"}),
+    ),
+    (
+        "(iii)",
+        "PET's gradient is made of D_on and the prior, not of actor, critic, Q, proposals or logs",
+        "full",
+        "out:adapters",
+        frozenset({"proposals", "offline", "actor", "critic", "q", "ppo_optimizers"}),
+    ),
     ("(iv)", "no array of D_off reaches the new policy", "full", "out:actor", frozenset({"offline"})),
     ("(iv)", "no array of D_off reaches the optimizers, Q or the prior", "full", "out:rest", frozenset({"offline"})),
 )
@@ -200,8 +224,20 @@ def _worst(rows: Iterable[Mapping[str, Any]], name: str, largest: bool) -> float
 def measured_claims(metrics: list[Mapping[str, Any]]) -> list[Claim]:
     """Definition 1 on what was logged: the worst value over all iterations counts."""
     checks = (
-        ("(i)", "every row of the actor update is of the current batch (share)", "batch_fresh", False, lambda v: v == 1),
-        ("(i)", "ratio is 1 at the first minibatch (largest error)", "ratio_error", True, lambda v: v < RATIO_TOLERANCE),
+        (
+            "(i)",
+            "every row of the actor update is of the current batch (share)",
+            "batch_fresh",
+            False,
+            lambda v: v == 1,
+        ),
+        (
+            "(i)",
+            "ratio is 1 at the first minibatch (largest error)",
+            "ratio_error",
+            True,
+            lambda v: v < RATIO_TOLERANCE,
+        ),
         ("(ii)", "SPR, smallest", "spr", False, lambda v: v == 1),
         ("(iii)", "share of PET rows from the current batch, smallest", "pet_spr", False, lambda v: v == 1),
         ("(iv)", "OGLR, largest", "oglr", True, lambda v: v == 0),

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 from jax.extend import core as jex
+from jax.interpreters.partial_eval import dce_jaxpr
 
 Labels = frozenset[str]
 NOTHING: Labels = frozenset()
@@ -59,7 +60,10 @@ def trace(function: Callable[..., Mapping[str, Any]], arguments: Mapping[str, An
         results.update({name: len(jax.tree.leaves(result[name])) for name in sorted(result)})
         return [jax.tree.leaves(result[name]) for name in sorted(result)]
 
-    return Traced(jax.make_jaxpr(flat_function)(*flat).jaxpr, owners, results)
+    jaxpr = jax.make_jaxpr(flat_function)(*flat).jaxpr
+    # Only what contributes to a result counts: diagnostics that are not returned drop out.
+    jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=True)
+    return Traced(jaxpr, owners, results)
 
 
 class _Walker:

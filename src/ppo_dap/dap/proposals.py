@@ -50,9 +50,7 @@ class States(eqx.Module):
     """What Q reads."""
 
 
-def choose_states(
-    weights: Float[Array, " rows"], key: PRNGKeyArray, num: int
-) -> Int[Array, " {num}"]:
+def choose_states(weights: Float[Array, " rows"], key: PRNGKeyArray, num: int) -> Int[Array, " {num}"]:
     """Indices of `num` different rows of D_on, uniform over those with weight (rows without come last)."""
     order = jnp.where(weights > 0, jax.random.uniform(key, weights.shape), 2.0)
     return jnp.argsort(order)[:num]
@@ -113,9 +111,7 @@ def propose(
     return proposals, metrics
 
 
-def q_drift(
-    q: QFunction, features: Float[Array, "n width"], sigma_max: float, config: ProposalConfig
-) -> Field:
+def q_drift(q: QFunction, features: Float[Array, "n width"], sigma_max: float, config: ProposalConfig) -> Field:
     """The last term of Eq. 8 as a field of (noisy action, noise level)."""
     q_gradient = jax.grad(lambda actions: jnp.sum(q(features, actions)))
 
@@ -145,5 +141,3 @@ def acceptance(chosen: Int[Array, "n k"]) -> Float[Array, ""]:
     k = chosen.shape[1]
     present = jnp.any(chosen[:, :, None] == jnp.arange(k)[None, None, :], axis=1)
     return jnp.mean(present.astype(jnp.float32))
-
-

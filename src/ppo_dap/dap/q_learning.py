@@ -24,9 +24,7 @@ class QData(eqx.Module):
     weights: Float[Array, " rows"]
 
 
-def q_loss(
-    q: QFunction, critic: Critic, rows: QData, shared: bool
-) -> Float[Array, ""]:
+def q_loss(q: QFunction, critic: Critic, rows: QData, shared: bool) -> Float[Array, ""]:
     """Mean squared error of Q(s, a) against r + gamma (1 - terminated) V(s')."""
     features = q_features(critic, q, rows.observations, shared)
     values = q(features, rows.actions[:, None, :])[:, 0]

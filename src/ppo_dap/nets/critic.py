@@ -20,7 +20,9 @@ class Critic(eqx.Module):
     def create(key: PRNGKeyArray, observation_size: int, hidden_size: int) -> Critic:
         """Orthogonal start, gain 1 on the value head."""
         trunk_key, head_key = jax.random.split(key)
-        return Critic(create_trunk(trunk_key, observation_size, hidden_size), Linear.orthogonal(head_key, hidden_size, 1, 1.0))
+        return Critic(
+            create_trunk(trunk_key, observation_size, hidden_size), Linear.orthogonal(head_key, hidden_size, 1, 1.0)
+        )
 
     def features(self, observations: Float[Array, "n obs"]) -> Float[Array, "n width"]:
         """The trunk's features, which Q may read."""
@@ -58,9 +60,7 @@ class QFunction(eqx.Module):
             Linear.orthogonal(keys[3], hidden_size, 1, 1.0),
         )
 
-    def __call__(
-        self, features: Float[Array, "n width"], actions: Float[Array, "n k act"]
-    ) -> Float[Array, "n k"]:
+    def __call__(self, features: Float[Array, "n width"], actions: Float[Array, "n k act"]) -> Float[Array, "n k"]:
         """Q at k actions of each state, in scaled-reward units; actions are scaled."""
         hidden = jnp.tanh(self.state(features)[:, None, :] + self.action(actions))
         return self.out(hidden)[..., 0]

@@ -10,9 +10,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 
-def importance_ratio(
-    log_probs: Float[Array, " n"], old_log_probs: Float[Array, " n"]
-) -> Float[Array, " n"]:
+def importance_ratio(log_probs: Float[Array, " n"], old_log_probs: Float[Array, " n"]) -> Float[Array, " n"]:
     """Eq. 4: pi_theta(a | s) / pi_theta_old(a | s)."""
     return checkpoint_name(jnp.exp(log_probs - old_log_probs), "ratio")
 

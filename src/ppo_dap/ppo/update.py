@@ -137,8 +137,9 @@ class Settings(NamedTuple):
     """Weights of what the method adds (Eq. 9)."""
 
 
-def improve(
-    state: PPOState,
+def improve_actor(
+    actor: Actor,
+    optimizer: optax.OptState,
     rows: Rows,
     added: Any,
     key: PRNGKeyArray,
@@ -146,73 +147,92 @@ def improve(
     *,
     ppo: PPOConfig,
     added_gradient: AddedGradient | None = None,
-) -> tuple[PPOState, dict[str, Float[Array, ""]]]:
-    """Step 4: `num_epochs` passes over D_on in shuffled minibatches.
+) -> tuple[Actor, optax.OptState, dict[str, Float[Array, ""]]]:
+    """Step 4, the actor: `num_epochs` passes over D_on in shuffled minibatches, fewer when the KL rule stops them.
 
-    `added` holds what `added_gradient` sees, leading axis a multiple of the number of minibatches (or no rows at all);
-    it is shuffled and dealt out like D_on's rows, by a random stream of its own.
+    `added` holds what `added_gradient` sees, with a multiple of the number of minibatches as leading axis; it is
+    shuffled and dealt out like D_on's rows, by a random stream of its own.
     """
     num_minibatches = ppo.rollout_steps // ppo.minibatch_size
-    old_log_std = state.actor.log_std
+    old_log_std = actor.log_std
 
     def minibatch_step(carry, batch):
-        state, _ = carry
-        own, extra = batch
-        state, metrics = _minibatch_step(state, own, extra, settings, old_log_std, ppo, added_gradient)
-        return (state, metrics["policy_kl_minibatch"]), metrics
+        carry, metrics = _actor_step(*carry, *batch, settings, old_log_std, ppo, added_gradient)
+        return carry, metrics
+
+    def run(carry, epoch_key):
+        batches = (
+            _deal(rows, epoch_key, num_minibatches),
+            _deal(added, jax.random.fold_in(epoch_key, 1), num_minibatches),
+        )
+        carry, metrics = jax.lax.scan(minibatch_step, carry, batches)
+        return carry, jnp.mean(metrics["policy_kl_minibatch"]) > settings.kl_limit, metrics
+
+    def skip(carry, epoch_key):
+        shapes = jax.eval_shape(run, carry, epoch_key)[2]
+        return carry, jnp.array(True), jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), shapes)
 
     def epoch(carry, epoch_key):
-        def run(state):
-            batches = (_deal(rows, epoch_key, num_minibatches), _deal(added, jax.random.fold_in(epoch_key, 1), num_minibatches))
-            (state, _), metrics = jax.lax.scan(minibatch_step, (state, jnp.zeros(())), batches)
-            stop = jnp.mean(metrics["policy_kl_minibatch"]) > settings.kl_limit
-            return state, stop, metrics
+        learned, stopped = carry
+        learned, stopped, metrics = jax.lax.cond(stopped, skip, run, learned, epoch_key)
+        return (learned, stopped), metrics
 
-        def skip(state):
-            shapes = jax.eval_shape(run, state)[2]
-            return state, jnp.array(True), jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), shapes)
-
-        state, stopped = carry
-        state, stopped, metrics = jax.lax.cond(stopped, skip, run, state)
-        return (state, stopped), metrics
-
-    carry = (state, jnp.array(False))
-    (state, _), metrics = jax.lax.scan(epoch, carry, jax.random.split(key, ppo.num_epochs))
+    start = ((actor, optimizer), jnp.array(False))
+    ((actor, optimizer), _), metrics = jax.lax.scan(epoch, start, jax.random.split(key, ppo.num_epochs))
     summary = {name: jnp.nanmean(values) for name, values in metrics.items()}
     summary["ratio_error"] = metrics["ratio_error"][0, 0]
-    summary["actor_updates"] = jnp.sum(~jnp.isnan(metrics["ppo_loss"])).astype(jnp.float32)
-    return state, summary
+    summary["actor_updates"] = jnp.sum(~jnp.isnan(metrics["policy_kl_minibatch"])).astype(jnp.float32)
+    return actor, optimizer, summary
 
 
-def _minibatch_step(state, own: Rows, extra, settings: Settings, old_log_std, ppo: PPOConfig, added_gradient):
-    actor = checkpoint_name_tree(state.actor, "theta")
+def _actor_step(actor, optimizer, own: Rows, extra, settings: Settings, old_log_std, ppo: PPOConfig, added_gradient):
+    actor = jax.tree.map(lambda leaf: checkpoint_name(leaf, "theta"), actor)
     (loss, (means, ratio)), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(actor, own, ppo.clip_epsilon)
     # The barrier keeps the compiler from fusing PPO's gradient with what is added to it: same bits with and without.
     gradient, loss, means, ratio = jax.lax.optimization_barrier((gradient, loss, means, ratio))
-    v_loss, v_gradient = jax.value_and_grad(value_loss)(state.critic, own)
-    policy_kl = weighted_mean(
-        gaussian_kl(means, actor.log_std[None], own.old_means, old_log_std[None]), own.weights
-    )
+    policy_kl = gaussian_kl(means, actor.log_std[None], own.old_means, old_log_std[None])
     metrics = {
         "ppo_loss": loss,
-        "value_loss": v_loss,
-        "policy_kl_minibatch": policy_kl,
+        "policy_kl_minibatch": weighted_mean(policy_kl, own.weights),
         "ratio_error": jnp.max(jnp.abs(ratio - 1) * own.weights),
     }
     ppo_norm = tree_norm(gradient)
-    total = gradient
     if added_gradient is not None:
         extra_gradient, extra_metrics = added_gradient(actor, extra, settings.added_weights)
         extra_gradient = jax.lax.optimization_barrier(extra_gradient)
-        total = jax.tree.map(jnp.add, gradient, extra_gradient)
+        gradient = jax.tree.map(jnp.add, gradient, extra_gradient)
         metrics |= extra_metrics
-    metrics["actor_gradient_norm"] = tree_norm(total)
+    metrics["actor_gradient_norm"] = tree_norm(gradient)
     metrics["pgshare"] = ppo_norm / (metrics["actor_gradient_norm"] + 1e-8)
-    rate = settings.learning_rate
-    actor, actor_optimizer = _adam(state.actor, total, state.actor_optimizer, rate, ppo.max_grad_norm)
-    v_gradient = jax.tree.map(lambda g: ppo.value_coefficient * g, v_gradient)
-    critic, critic_optimizer = _adam(state.critic, v_gradient, state.critic_optimizer, rate, ppo.max_grad_norm)
-    return PPOState(actor, critic, actor_optimizer, critic_optimizer), metrics
+    learned = _adam(actor, gradient, optimizer, settings.learning_rate, ppo.max_grad_norm)
+    return learned, metrics
+
+
+def improve_critic(
+    critic: Critic,
+    optimizer: optax.OptState,
+    rows: Rows,
+    key: PRNGKeyArray,
+    learning_rate: Float[Array, ""],
+    *,
+    ppo: PPOConfig,
+) -> tuple[Critic, optax.OptState, dict[str, Float[Array, ""]]]:
+    """Step 4, V: `num_epochs` passes over D_on. Apart from the actor's, so that nothing that is added there, and no KL
+    rule, changes what V learns.
+    """
+
+    def step(carry, batch):
+        critic, optimizer = carry
+        loss, gradient = jax.value_and_grad(value_loss)(critic, batch)
+        gradient = jax.tree.map(lambda g: ppo.value_coefficient * g, gradient)
+        return _adam(critic, gradient, optimizer, learning_rate, ppo.max_grad_norm), loss
+
+    def epoch(carry, epoch_key):
+        return jax.lax.scan(step, carry, _deal(rows, epoch_key, ppo.rollout_steps // ppo.minibatch_size))
+
+    keys = jax.random.split(key, ppo.num_epochs)
+    (critic, optimizer), losses = jax.lax.scan(epoch, (critic, optimizer), keys)
+    return critic, optimizer, {"value_loss": jnp.mean(losses)}
 
 
 def _adam(params, gradient, optimizer_state, learning_rate, max_norm: float):
@@ -227,8 +247,3 @@ def _deal(rows, key: PRNGKeyArray, num_minibatches: int):
     count = jax.tree.leaves(rows)[0].shape[0] if jax.tree.leaves(rows) else 0
     order = jax.random.permutation(key, count)
     return jax.tree.map(lambda x: x[order].reshape(num_minibatches, -1, *x.shape[1:]), rows)
-
-
-def checkpoint_name_tree(tree, name: str):
-    """`checkpoint_name` on every leaf."""
-    return jax.tree.map(lambda leaf: checkpoint_name(leaf, name), tree)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
-
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -83,7 +82,7 @@ _CHOICES = {
 }
 
 
-def _validate(name: str, value: object, default: object) -> None:
+def _validate(name: str, value: Any, default: object) -> None:
     """Refuse a value that is not of its default's type, or not in its range."""
     if name in _CHOICES:
         if value not in _CHOICES[name]:

@@ -17,7 +17,7 @@ from ppo_dap.dap.guide import GuideState, adapt_prior, create_guide, learn_q, ma
 from ppo_dap.dap.objective import Batch, admit, proposal_gradient
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.rollout import Rollout
-from ppo_dap.ppo.update import Normaliser, PPOState, Rows, Settings, estimate_advantages, improve
+from ppo_dap.ppo.update import Normaliser, PPOState, Rows, Settings, estimate_advantages, improve_actor, improve_critic
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 
 Metrics = dict[str, Float[Array, ""]]
@@ -46,9 +46,7 @@ class Schedule(NamedTuple):
     pet_steps: Int[Array, ""]
 
 
-def create_learner(
-    key: PRNGKeyArray, sizes: tuple[int, int], config: Config, denoiser: Denoiser | None
-) -> Learner:
+def create_learner(key: PRNGKeyArray, sizes: tuple[int, int], config: Config, denoiser: Denoiser | None) -> Learner:
     """Fresh networks; the guide's random stream is its own, so PPO's start does not depend on it."""
     ppo = PPOState.create(key, *sizes, config.ppo.hidden_size)
     if denoiser is None:
@@ -61,18 +59,16 @@ class Stages:
 
     def __init__(self, config: Config, diffusion: DiffusionConfig | None):
         self.advantages = jax.jit(partial(_advantages, config=config))
-        self.improve = jax.jit(
-            partial(improve, ppo=config.ppo, added_gradient=None if diffusion is None else proposal_gradient)
-        )
+        added_gradient = None if diffusion is None else proposal_gradient
+        self.actor = jax.jit(partial(improve_actor, ppo=config.ppo, added_gradient=added_gradient))
+        self.critic = jax.jit(partial(improve_critic, ppo=config.ppo))
         self.policy_metrics = jax.jit(audit.policy_metrics)
         if diffusion is not None:
             self.propose = jax.jit(partial(make_proposals, config=config, diffusion=diffusion))
             self.learn_q = jax.jit(partial(learn_q, config=config))
             self.adapt = jax.jit(partial(adapt_prior, config=config, diffusion=diffusion))
             self.leakage = jax.jit(partial(audit.leakage, ppo=config.ppo))
-            self.prior_metrics = jax.jit(
-                partial(audit.prior_metrics, diffusion=diffusion, config=config.proposals)
-            )
+            self.prior_metrics = jax.jit(partial(audit.prior_metrics, diffusion=diffusion, config=config.proposals))
 
 
 def _advantages(
@@ -100,36 +96,44 @@ def update(
     run: Callable[..., Any] = call,
 ) -> tuple[Learner, Metrics]:
     """Steps 2 to 6 of Algorithm 1 on the rollout of step 1. Without a guide it is PPO."""
-    ppo, guide, old_log_std = learner.ppo, learner.guide, learner.ppo.actor.log_std
-    keys = [jax.random.fold_in(key, stream) for stream in range(5)]
+    old, guide = learner.ppo, learner.guide
+    keys = [jax.random.fold_in(key, stream) for stream in range(6)]
+    settings, weights = schedule.settings, schedule.settings.added_weights
 
     # 2) Advantages with GAE; rows that are not of the current batch lose their weight.
-    rows, batch, metrics = run("update", stages.advantages, ppo.critic, rollout, normaliser, schedule.first_id)
-
-    if guide is None or frozen is None:
-        ppo, improved = run("update", stages.improve, ppo, rows, (), keys[0], schedule.settings)
-        return Learner(ppo, None), metrics | improved | run("audit", stages.policy_metrics, ppo.actor, old_log_std, rows)
+    rows, batch, metrics = run("update", stages.advantages, old.critic, rollout, normaliser, schedule.first_id)
 
     # 3) Value-guided proposals on states of D_on.
-    gated, q_spread, proposed = run(
-        "proposals", stages.propose, guide, frozen.denoiser, ppo.critic, rows, batch, schedule.beta, keys[1]
+    gated: Any = ()
+    if guide is not None and frozen is not None:
+        gated, q_spread, proposed = run(
+            "proposals", stages.propose, guide, frozen.denoiser, old.critic, rows, batch, schedule.beta, keys[1]
+        )
+        metrics |= proposed
+
+    # 4) The actor (Eq. 9) and V; Q by one-step TD.
+    actor, actor_optimizer, improved = run(
+        "update", stages.actor, old.actor, old.actor_optimizer, rows, gated, keys[0], settings
     )
-    # 4) Actor (Eq. 9) and V, then Q by one-step TD.
-    ppo, improved = run("update", stages.improve, ppo, rows, gated, keys[0], schedule.settings)
-    q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, ppo.critic, rows, keys[2])
-    ppo = eqx.tree_at(lambda p: p.critic, ppo, critic)
+    critic, critic_optimizer, valued = run(
+        "update", stages.critic, old.critic, old.critic_optimizer, rows, keys[2], settings.learning_rate
+    )
+    metrics |= improved | valued | run("audit", stages.policy_metrics, actor, old.actor.log_std, rows)
+    if guide is None or frozen is None:
+        return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None), metrics
+    q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, rows, keys[3])
+
     # 5) PET: the adapters alone, on D_on.
     adapters, pet_optimizer, adapted = run(
-        "pet", stages.adapt, guide, frozen.denoiser, rows, batch, schedule.pet_steps, keys[3]
+        "pet", stages.adapt, guide, frozen.denoiser, rows, batch, schedule.pet_steps, keys[4]
     )
+
     # 6) Monitoring.
-    norm, weights = improved["actor_gradient_norm"], schedule.settings.added_weights
-    audited = (
-        run("audit", stages.policy_metrics, ppo.actor, old_log_std, rows)
-        | run("audit", stages.leakage, ppo.actor, frozen.probe, normaliser, rows, batch, weights, norm)
-        | run(
-            "audit", stages.prior_metrics, ppo.actor, frozen.denoiser, guide.adapters, adapters, gated.proposals, keys[4]
-        )
+    norm = improved["actor_gradient_norm"]
+    leaked = run("audit", stages.leakage, actor, frozen.probe, normaliser, rows, batch, weights, norm)
+    moved = run(
+        "audit", stages.prior_metrics, actor, frozen.denoiser, guide.adapters, adapters, gated.proposals, keys[5]
     )
+    ppo = PPOState(actor, critic, actor_optimizer, critic_optimizer)
     guide = GuideState(q, q_optimizer, q_spread, adapters, pet_optimizer)
-    return Learner(ppo, guide), metrics | proposed | improved | learned | adapted | audited
+    return Learner(ppo, guide), metrics | learned | adapted | leaked | moved

@@ -130,7 +130,9 @@ def _make_trainer(
     frozen, diffusion = None, None
     if prior is not None:
         diffusion = prior.config
-        frozen = Frozen(prior.denoiser, audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions)))
+        frozen = Frozen(
+            prior.denoiser, audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions))
+        )
     learner = create_learner(
         jax.random.key(config.run.seed), sizes, config, None if frozen is None else frozen.denoiser
     )
@@ -184,9 +186,7 @@ def _check_logs(config: Config, logs: Any, spec: TaskSpec) -> Logs | None:
     if logs is None:
         raise InputError(f"warm_start {config.warm.warm_start!r} needs logs")
     logs = logs if isinstance(logs, Logs) else load_logs(logs)
-    require_compatible(
-        logs, task=spec.task, observation_size=spec.observation_size, action_size=spec.action_size
-    )
+    require_compatible(logs, task=spec.task, observation_size=spec.observation_size, action_size=spec.action_size)
     return logs
 
 
