@@ -1,6 +1,6 @@
 """ppo-dap: logged trajectories in, faster PPO out. See the README for the commands.
 
-The names below are the whole public interface; each is imported when it is first used, so that `import ppo_dap` is fast.
+The names below are the whole public interface; each is imported when it is first used, so that importing is fast.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from ppo_dap.logs import Logs as Logs
     from ppo_dap.logs import check_logs as check_logs
     from ppo_dap.logs import load_logs as load_logs
-    from ppo_dap.methods import capability_rows as methods
     from ppo_dap.priors import fit_prior as fit_prior
     from ppo_dap.priors import load_prior as load_prior
     from ppo_dap.training.run import Run as Run

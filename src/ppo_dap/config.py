@@ -1,8 +1,8 @@
 """Every setting of a run, as frozen dataclasses: the paper's Table 2, the PPO recipe, and what both leave open.
 
-Field names are unique over all groups, so one flat name (`lambda_kl`, on the command line `--lambda-kl`) finds its field;
-`replace` does that. `PRESETS` holds the two settings that every result is quoted with: `paper` is Table 2 to the letter,
-`tuned` is the best that our own studies found (docs/results.md says on which seeds).
+Field names are unique over all groups, so one flat name (`lambda_kl`, on the command line `--lambda-kl`) finds its
+field; `replace` does that. `PRESETS` holds the two settings that every result is quoted with: `paper` is Table 2 to the
+letter, `tuned` is the best that our own studies found (docs/results.md says on which seeds).
 """
 
 from __future__ import annotations
@@ -218,19 +218,27 @@ def flatten(config: Config) -> dict[str, Any]:
 _positive = (lambda v: v > 0, "a number above 0")
 _at_least_0 = (lambda v: v >= 0, "a number of 0 or more")
 _share = (lambda v: 0 < v <= 1, "a number above 0 and at most 1")
+# fmt: off
 _RULES: dict[str, tuple[Any, str]] = {
     **dict.fromkeys(
-        ["num_envs", "rollout_steps", "minibatch_size", "num_epochs", "hidden_size", "num_proposals", "sampler_steps", "q_hidden_size", "q_epochs", "pet_minibatch_size", "adapter_rank", "warm_start_epochs", "steps", "eval_episodes", "checkpoint_every", "threads", "learning_rate", "max_grad_norm", "kl_target", "observation_clip", "reward_clip", "guidance_cap", "proxy_std_floor", "q_learning_rate", "pet_learning_rate", "warm_start_std_floor", "clip_epsilon"],
+        ("num_envs", "rollout_steps", "minibatch_size", "num_epochs", "hidden_size", "num_proposals", "sampler_steps",
+         "q_hidden_size", "q_epochs", "pet_minibatch_size", "adapter_rank", "warm_start_epochs", "steps",
+         "eval_episodes", "checkpoint_every", "threads", "learning_rate", "max_grad_norm", "kl_target",
+         "observation_clip", "reward_clip", "guidance_cap", "proxy_std_floor", "q_learning_rate", "pet_learning_rate",
+         "warm_start_std_floor", "clip_epsilon"),
         _positive,
     ),
     **dict.fromkeys(
-        ["value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every", "seed"], _at_least_0
+        ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every",
+         "seed"),
+        _at_least_0,
     ),
     **dict.fromkeys(["proposal_fraction", "beta_anneal"], _share),
     **dict.fromkeys(("gamma", "gae_lambda"), (lambda v: 0 <= v <= 1, "a number from 0 to 1")),
     **dict.fromkeys(("displacement_cap", "top_k"), (lambda v: v is None or v > 0, "a number above 0, or None")),
     "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),
 }
+# fmt: on
 
 
 def validate(config: Config) -> None:

@@ -25,8 +25,9 @@ def rows(n=64):
     return jax.random.normal(keys[0], (n, 3)), jnp.zeros((n, 0)), 0.3 * jax.random.normal(keys[1], (n, 2))
 
 
+@jax.jit
 def loss_and_gradient(adapters, denoiser, key):
-    return jax.jit(jax.value_and_grad(lambda a: denoising_loss(denoiser, a, *rows(), key, CONFIG)))(adapters)
+    return jax.value_and_grad(lambda a: denoising_loss(denoiser, a, *rows(), key, CONFIG))(adapters)
 
 
 def adapted(denoiser, kind, steps, learning_rate=1e-2):
@@ -42,16 +43,22 @@ def adapted(denoiser, kind, steps, learning_rate=1e-2):
 
 
 def samples(denoiser, adapters):
-    run = jax.jit(lambda d, a: sample_actions(d, a, *rows()[:2], jax.random.key(3), 4, CONFIG)[0])
-    return np.asarray(run(denoiser, adapters))
+    return np.asarray(_samples(denoiser, adapters))
+
+
+@jax.jit
+def _samples(denoiser, adapters):
+    return sample_actions(denoiser, adapters, *rows()[:2], jax.random.key(3), 4, CONFIG)[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_adapters_start_as_an_exact_identity(denoiser, kind):
     adapters = init_adapters(jax.random.key(2), denoiser, kind, 4)
     x, embedding = jax.random.normal(jax.random.key(4), (64, 5, 2)), denoiser.embed(*rows()[:2])
-    forward = jax.jit(lambda a: denoiser(x, embedding, jnp.asarray(0.3), a))
-    np.testing.assert_array_equal(forward(adapters), forward(None))
+    # All inputs are arguments: XLA evaluates what it can fold with another program, and other last bits.
+    forward = jax.jit(lambda d, x, e, sigma, a: d(x, e, sigma, a))
+    inputs = denoiser, x, embedding, jnp.asarray(0.3)
+    np.testing.assert_array_equal(forward(*inputs, adapters), forward(*inputs, None))
     np.testing.assert_array_equal(samples(denoiser, adapters), samples(denoiser, None))
     assert float(adapter_norm(adapters)) == 0
 

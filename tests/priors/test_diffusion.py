@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,17 +24,18 @@ def zero_output(config, sigma_data, action_size=3):
     return Denoiser(**{**vars(denoiser), "out": silent})
 
 
-def loss_of_silent_network(rows=200_000, **options):
+def loss_of_silent_network(rows=50_000, **options):
     config = DiffusionConfig(width=4, depth=1, **options)
     actions = SD * jax.random.normal(jax.random.key(5), (rows, 3))
     inputs = jnp.zeros((rows, 2)), jnp.zeros((rows, 0)), actions
-    return float(denoising_loss(zero_output(config, SD), None, *inputs, jax.random.key(6), config))
+    loss = jax.jit(denoising_loss, static_argnames="config")
+    return float(loss(zero_output(config, SD), None, *inputs, jax.random.key(6), config))
 
 
 def test_edm_weighting_makes_every_level_count_one_per_dimension():
     """The posterior variance sd^2 sigma^2 / (sd^2 + sigma^2) is the inverse of the weight: 3 dimensions give 3."""
-    assert loss_of_silent_network() == pytest.approx(3.0, rel=0.01)
-    assert loss_of_silent_network(noise_distribution="loguniform") == pytest.approx(3.0, rel=0.01)
+    assert loss_of_silent_network() == pytest.approx(3.0, rel=0.02)
+    assert loss_of_silent_network(noise_distribution="loguniform") == pytest.approx(3.0, rel=0.02)
 
 
 def test_equation_6_as_printed_has_its_closed_form():
@@ -39,7 +43,7 @@ def test_equation_6_as_printed_has_its_closed_form():
     low, high = 0.05, 2.0
     options = {"loss_weighting": "none", "noise_distribution": "loguniform", "sigma_min": low, "sigma_max": high}
     mean = SD**2 * np.log((high**2 + SD**2) / (low**2 + SD**2)) / (2 * np.log(high / low))
-    assert loss_of_silent_network(**options) == pytest.approx(3 * mean, rel=0.01)
+    assert loss_of_silent_network(**options) == pytest.approx(3 * mean, rel=0.02)
 
 
 def test_sigmas_follow_their_distribution():
@@ -105,7 +109,8 @@ def test_observations_are_normalised_and_clipped():
 def test_moments_of_the_logs_do_not_move(gaussian_fit):
     denoiser, config = gaussian_fit
     inputs = jnp.ones((8, 1)), jnp.zeros((8, 0)), jnp.ones((8, 1))
-    gradient = jax.grad(denoising_loss)(denoiser, None, *inputs, jax.random.key(0), config)
+    loss = jax.jit(denoising_loss, static_argnames="config")
+    gradient = jax.grad(loss)(denoiser, None, *inputs, jax.random.key(0), config)
     assert float(gradient.sigma_data) == 0
     assert not np.any(gradient.observation_mean)
     assert not np.any(gradient.observation_std)
@@ -124,16 +129,32 @@ def test_condition_conditions(labelled):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"noise_distribution": "log-normal"}, "did you mean 'lognormal'"),
         ({"width": 0}, "width must be"),
         ({"max_steps": -1}, "max_steps must be"),
         ({"sigma_min": 6.0}, "must be below sigma_max"),
         ({"sigma_max": float("nan")}, "sigma_max must be"),
         ({"validation_fraction": 1.5}, "below 1"),
-        ({"width": "64"}, "width must be"),
-        ({"depth": 1.5}, "depth must be"),
     ],
 )
 def test_impossible_settings_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         DiffusionConfig(**options)
+
+
+def test_settings_of_the_wrong_type_are_refused():
+    """In a process of its own, since the tests' type checker would speak first."""
+    code = """
+from ppo_dap.errors import InputError
+from ppo_dap.priors.diffusion import DiffusionConfig
+for options in ({"noise_distribution": "log-normal"}, {"width": "64"}, {"depth": 1.5}, {"rho": True}):
+    try:
+        DiffusionConfig(**options)
+    except InputError as error:
+        print(error)
+"""
+    lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(lines) == 4
+    assert "did you mean 'lognormal'" in lines[0]
+    assert lines[1] == "width must be an integer above 0, not '64'"
+    assert lines[2] == "depth must be an integer above 0, not 1.5"
+    assert lines[3] == "rho must be a number above 0, not True"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, denoising_loss
 Provenance = Callable[[Int[Array, " n"], Float[Array, "n obs"]], Float[Array, " n"]]
 """(state_ids, raw states) -> 1 for each that is a row of D_on, else 0."""
 
-ADAM = optax.scale_by_adam(eps=1e-8)
+ADAM: Any = optax.scale_by_adam(eps=1e-8)
 
 
 class PETData(eqx.Module):

@@ -5,7 +5,7 @@ A run is strictly on-policy when the static claims hold for the traced update an
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,7 +75,7 @@ def leakage(
         actions=probe.actions,
         old_log_probs=log_prob(probe.actions, means, actor.log_std),
         old_means=means,
-        advantages=jnp.resize(rows.advantages, n),
+        advantages=jnp.resize(rows.advantages, (n,)),
         returns=jnp.zeros(n),
         q_targets=jnp.zeros(n),
         weights=jnp.ones(n),
@@ -221,7 +221,7 @@ def _worst(rows: Iterable[Mapping[str, Any]], name: str, largest: bool) -> float
     return (max(values) if largest else min(values)) if values else None
 
 
-def measured_claims(metrics: list[Mapping[str, Any]]) -> list[Claim]:
+def measured_claims(metrics: Sequence[Mapping[str, Any]]) -> list[Claim]:
     """Definition 1 on what was logged: the worst value over all iterations counts."""
     checks = (
         (

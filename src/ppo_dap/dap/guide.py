@@ -34,7 +34,7 @@ class GuideState(eqx.Module):
 def create_guide(
     key: PRNGKeyArray, critic: Critic | None, sizes: tuple[int, int], config: Config, denoiser: Denoiser
 ) -> GuideState:
-    """A fresh Q head and identity adapters for (observation, action) `sizes`; `critic` is the one whose trunk Q reads."""
+    """A fresh Q head and identity adapters for (observation, action) `sizes`; Q reads `critic`'s trunk."""
     q_key, adapter_key = jax.random.split(key)
     own_trunk = config.q.q_trunk == "separate"
     q = QFunction.create(q_key, *sizes, config.ppo.hidden_size, config.q.q_hidden_size, own_trunk)

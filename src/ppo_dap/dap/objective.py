@@ -41,7 +41,7 @@ class Batch(NamedTuple):
 def provenance(
     state_ids: Int[Array, " n"], raw_observations: Float[Array, "n obs"], batch: Batch
 ) -> Float[Array, " n"]:
-    """1 for every (state_id, state) that is a row of D_on with weight, else 0: the id and the state itself must match."""
+    """1 for every (state_id, state) that is a row of D_on with weight, else 0: id and state must both match."""
     row = state_ids - batch.first_id
     inside = (row >= 0) & (row < batch.weights.shape[0])
     row = jnp.where(inside, row, 0)

@@ -1,4 +1,4 @@
-"""Step 3 of Algorithm 1: D_syn, value-guided proposals of the prior on states of D_on, and their Gaussian proxy (Eq. 10)."""
+"""Step 3 of Algorithm 1: D_syn, value-guided proposals on states of D_on, and their Gaussian proxy (Eq. 10)."""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from ppo_dap.config import QConfig
 from ppo_dap.nets.critic import Critic, QFunction, q_features
 from ppo_dap.ppo.surrogate import weighted_mean
 
-ADAM = optax.scale_by_adam(eps=1e-5)
+ADAM: Any = optax.scale_by_adam(eps=1e-5)
 
 
 class QData(eqx.Module):
@@ -24,34 +26,34 @@ class QData(eqx.Module):
     weights: Float[Array, " rows"]
 
 
-def q_loss(q: QFunction, critic: Critic, rows: QData, shared: bool) -> Float[Array, ""]:
+def q_loss(q: QFunction, critic: Critic | None, rows: QData, shared: bool) -> Float[Array, ""]:
     """Mean squared error of Q(s, a) against r + gamma (1 - terminated) V(s')."""
     features = q_features(critic, q, rows.observations, shared)
     values = q(features, rows.actions[:, None, :])[:, 0]
     return weighted_mean(jnp.square(values - rows.targets), rows.weights)
 
 
-def trainable(q: QFunction, critic: Critic, config: QConfig):
+def trainable(q: QFunction, critic: Critic | None, config: QConfig) -> tuple:
     """What Q's gradient may move: Q, and with `q_trunk = "shared"` the value trunk as well."""
-    return (q, critic.trunk) if config.q_trunk == "shared" else (q,)
+    return (q, critic.trunk) if critic is not None and config.q_trunk == "shared" else (q,)
 
 
 def fit_q(
     q: QFunction,
-    critic: Critic,
+    critic: Critic | None,
     optimizer: optax.OptState,
     rows: QData,
     key: PRNGKeyArray,
     *,
     minibatch_size: int,
     config: QConfig,
-) -> tuple[QFunction, Critic, optax.OptState, Float[Array, ""]]:
+) -> tuple[QFunction, Critic | None, optax.OptState, Float[Array, ""]]:
     """`q_epochs` passes over D_on. The critic comes back as it was, except its trunk when it is shared."""
     num_minibatches = rows.targets.shape[0] // minibatch_size
     shared = config.q_trunk == "shared"
 
     def with_trunk(params):
-        return eqx.tree_at(lambda c: c.trunk, critic, params[1]) if shared else critic
+        return eqx.tree_at(lambda c: c.trunk, critic, params[1]) if len(params) > 1 else critic
 
     def step(carry, batch):
         params, optimizer = carry

@@ -1,4 +1,4 @@
-"""The Gaussian actor and the closed forms of its distribution. Actions are in scaled units: [-1, 1] is the task's box."""
+"""The Gaussian actor and the closed forms of its distribution. Actions are scaled: [-1, 1] is the task's box."""
 
 from __future__ import annotations
 

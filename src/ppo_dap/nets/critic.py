@@ -67,10 +67,12 @@ class QFunction(eqx.Module):
 
 
 def q_features(
-    critic: Critic, q: QFunction, observations: Float[Array, "n obs"], shared: bool
+    critic: Critic | None, q: QFunction, observations: Float[Array, "n obs"], shared: bool
 ) -> Float[Array, "n width"]:
     """What Q reads: its own trunk if it has one, else V's trunk, with the gradient stopped unless `shared`."""
     if q.trunk is not None:
         return jnp.tanh(q.trunk(observations))
+    if critic is None:
+        raise ValueError("a Q without a trunk of its own reads a critic's")
     features = critic.features(observations)
     return features if shared else jax.lax.stop_gradient(features)

@@ -78,7 +78,9 @@ def load_policy(path: str | os.PathLike) -> Policy:
     return Policy(
         tuple(tensors[f"weight{i}"] for i in range(depth)),
         tuple(tensors[f"bias{i}"] for i in range(depth)),
-        *(tensors[name] for name in ("log_std", "observation_mean", "observation_std")),
+        tensors["log_std"],
+        tensors["observation_mean"],
+        tensors["observation_std"],
         float(meta["observation_clip"]),
         tensors["action_low"],
         tensors["action_high"],

@@ -6,6 +6,7 @@ import time as clock
 from dataclasses import dataclass, field
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -16,17 +17,17 @@ from ppo_dap.tasks import VectorEnv
 class Rollout(eqx.Module):
     """D_on of one iteration. Observations are raw, actions scaled and not clipped (as sampled)."""
 
-    state_ids: Int[Array | np.ndarray, "time envs"]
+    state_ids: Int[Array, "time envs"]
     """Unique over a run: `iteration * rows + row`. What proposals and PET minibatches are traced by."""
-    observations: Float[Array | np.ndarray, "time envs obs"]
-    next_observations: Float[Array | np.ndarray, "time envs obs"]
-    actions: Float[Array | np.ndarray, "time envs act"]
-    log_probs: Float[Array | np.ndarray, "time envs"]
-    means: Float[Array | np.ndarray, "time envs act"]
-    rewards: Float[Array | np.ndarray, "time envs"]
-    terminated: Bool[Array | np.ndarray, "time envs"]
-    truncated: Bool[Array | np.ndarray, "time envs"]
-    valid: Bool[Array | np.ndarray, "time envs"]
+    observations: Float[Array, "time envs obs"]
+    next_observations: Float[Array, "time envs obs"]
+    actions: Float[Array, "time envs act"]
+    log_probs: Float[Array, "time envs"]
+    means: Float[Array, "time envs act"]
+    rewards: Float[Array, "time envs"]
+    terminated: Bool[Array, "time envs"]
+    truncated: Bool[Array, "time envs"]
+    valid: Bool[Array, "time envs"]
 
 
 @dataclass
@@ -68,7 +69,9 @@ class Collector:
             self.observations = step.observations
         out["log_probs"] = policy.log_prob_of_noise(noise)
         rows = np.arange(time * envs, dtype=np.int32) + np.int32(iteration * time * envs)
-        return Rollout(state_ids=rows.reshape(time, envs), **out)
+        return Rollout(
+            **{name: jnp.asarray(x) for name, x in out.items()}, state_ids=jnp.asarray(rows.reshape(time, envs))
+        )
 
     def _count(self, step) -> None:
         self.returns += step.rewards

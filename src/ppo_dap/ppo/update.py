@@ -23,7 +23,7 @@ from ppo_dap.ppo.gae import gae
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.surrogate import clipped_surrogate, importance_ratio, normalise, weighted_mean
 
-ADAM = optax.scale_by_adam(eps=1e-5)
+ADAM: Any = optax.scale_by_adam(eps=1e-5)
 
 
 class PPOState(eqx.Module):
@@ -157,8 +157,7 @@ def improve_actor(
     old_log_std = actor.log_std
 
     def minibatch_step(carry, batch):
-        carry, metrics = _actor_step(*carry, *batch, settings, old_log_std, ppo, added_gradient)
-        return carry, metrics
+        return _actor_step(carry, batch, settings, old_log_std, ppo, added_gradient)
 
     def run(carry, epoch_key):
         batches = (
@@ -185,7 +184,8 @@ def improve_actor(
     return actor, optimizer, summary
 
 
-def _actor_step(actor, optimizer, own: Rows, extra, settings: Settings, old_log_std, ppo: PPOConfig, added_gradient):
+def _actor_step(carry, batch, settings: Settings, old_log_std, ppo: PPOConfig, added_gradient):
+    (actor, optimizer), (own, extra) = carry, batch
     actor = jax.tree.map(lambda leaf: checkpoint_name(leaf, "theta"), actor)
     (loss, (means, ratio)), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(actor, own, ppo.clip_epsilon)
     # The barrier keeps the compiler from fusing PPO's gradient with what is added to it: same bits with and without.

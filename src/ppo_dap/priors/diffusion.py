@@ -45,11 +45,11 @@ class DiffusionConfig:
     """Weight of a noise level in the loss: Karras et al.'s, which lets each level count the same, or Eq. 6 as is."""
     batch_size: int = 512
     """Rows of one step of the fit."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 5e-3
     """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
     warmup_steps: int = 200
     """Steps over which the rate rises from 0."""
-    max_steps: int = 10_000
+    max_steps: int = 6_000
     """Most steps of the fit."""
     chunk_steps: int = 200
     """Steps between two looks at the held-out loss."""

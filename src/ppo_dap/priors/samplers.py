@@ -98,6 +98,15 @@ def _guide(stepped, x, sigma, drift, displacement, cap):
     return stepped + push, displacement + norm
 
 
+def centred_start(denoise: Field, sigma: Float[Array, ""], noise: Float[Array, "n k act"]) -> Float[Array, "n k act"]:
+    """Unit noise whose `sigma`-fold is spread around what the denoiser expects, not around 0.
+
+    A noisy action really has the mean of the actions. A deterministic solver keeps such an offset: with modes 0.45 and
+    -0.4 it is 0.013 in their shares at sigma = 5. The stochastic one forgets it.
+    """
+    return noise + denoise(sigma * noise, sigma) / sigma
+
+
 SAMPLERS = {"ancestral": ancestral, "dpmpp_2m": dpmpp_2m}
 
 
@@ -123,11 +132,14 @@ def sample_actions(
     denoiser, adapters = merge(denoiser, adapters)
     embedding = denoiser.embed(observations, condition)
     sigmas = karras_sigmas(num_steps, config.sigma_min, config.sigma_max, config.rho)
-    # All noise in one draw outside the loop; the deterministic sampler needs only its start.
-    draws = num_steps + 1 if sampler == "ancestral" else 1
+    # All noise in one draw outside the loop; the deterministic solver needs only its start.
+    deterministic = sampler == "dpmpp_2m"
+    draws = 1 if deterministic else num_steps + 1
     noise = jax.random.normal(key, (draws, observations.shape[0], num, denoiser.out.weight.shape[0]))
 
     def denoise(x, sigma):
         return denoiser(x, embedding, sigma, adapters)
 
+    if deterministic:
+        noise = centred_start(denoise, sigmas[0], noise[0])[None]
     return SAMPLERS[sampler](denoise, sigmas, noise, drift, displacement_cap)

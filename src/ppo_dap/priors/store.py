@@ -15,15 +15,17 @@ import safetensors.numpy
 
 from ppo_dap.errors import InputError
 
-FORMAT = "ppo-dap prior"
+KEY = "ppo-dap prior"
 VERSION = 1
 
 
 def write(path: str | Path, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> None:
     """Write exactly `path`, all of it or nothing: a reader never sees half a file."""
     path = Path(path)
-    metadata = {"format": FORMAT, "version": str(VERSION), "prior": json.dumps(header)}
-    data = safetensors.numpy.save({name: np.ascontiguousarray(t) for name, t in tensors.items()}, metadata)
+    # One entry: safetensors writes several in random order, and the same prior must give the same bytes.
+    metadata = {KEY: json.dumps({"version": VERSION, **header}, sort_keys=True)}
+    # np.asarray, since np.ascontiguousarray gives a scalar an axis.
+    data = safetensors.numpy.save({name: np.asarray(t, order="C") for name, t in tensors.items()}, metadata)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -52,11 +54,12 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             tensors = {name: file.get_tensor(name) for name in list(file.keys())}
     except (safetensors.SafetensorError, OSError) as error:
         raise InputError(f"{path} is damaged or not a prior file ({_one_line(error)})") from error
-    if metadata.get("format") != FORMAT:
+    if KEY not in metadata:
         raise InputError(f"{path} is a safetensors file but not a prior: write one with `ppo-dap pretrain`")
     try:
-        version, header = int(metadata["version"]), json.loads(metadata["prior"])
-    except (KeyError, ValueError) as error:
+        header = json.loads(metadata[KEY])
+        version = int(header["version"])
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged: its header cannot be read ({_one_line(error)})") from error
     if version > VERSION:
         raise InputError(

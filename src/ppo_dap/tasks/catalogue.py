@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -68,7 +69,9 @@ def make_gymnasium(task: str) -> Any:
     try:
         return gymnasium.make(task)
     except gymnasium.error.UnregisteredEnv:
-        raise unknown("task", task, set(gymnasium.registry) | ENVPOOL_TASKS) from None
+        known = set(gymnasium.registry) | ENVPOOL_TASKS
+        near = difflib.get_close_matches(task, known, n=1)
+        raise unknown("task", task, known if near else {t for t in ENVPOOL_TASKS if t.endswith("v5")}) from None
     except gymnasium.error.Error as error:
         raise InputError(f"task {task!r} cannot be made: {' '.join(str(error).split())}") from error
 

@@ -67,8 +67,11 @@ def example_rollout(config: Config, observation_size: int, action_size: int) -> 
     grid = (config.ppo.rollout_steps // envs, envs)
     wide = {
         name: jnp.zeros((*grid, size))
-        for name, size in (("observations", observation_size), ("next_observations", observation_size))
-        + (("actions", action_size), ("means", action_size))
+        for size, names in (
+            (observation_size, ("observations", "next_observations")),
+            (action_size, ("actions", "means")),
+        )
+        for name in names
     }
     flags = {name: jnp.zeros(grid, bool) for name in ("terminated", "truncated", "valid")}
     scalars = {name: jnp.zeros(grid) for name in ("log_probs", "rewards")}

@@ -17,13 +17,13 @@ class Recorder:
     def __init__(self, folder: Path, tensorboard: bool, keep: Mapping[str, int] | None = None):
         """`keep` says how many lines of each table belong to the checkpoint that the run resumes from (else 0)."""
         folder.mkdir(parents=True, exist_ok=True)
-        self._files = {}
+        self._files: dict[str, Any] = {}
         for table in TABLES:
             path = folder / f"{table}.jsonl"
             rows = path.read_text().splitlines(keepends=True)[: keep[table]] if keep else []
             path.write_text("".join(rows))
             self._files[table] = open(path, "a")  # noqa: SIM115 (open for as long as the run is)
-        self.counts = dict(keep) if keep else dict.fromkeys(TABLES, 0)
+        self.counts: dict[str, int] = dict(keep) if keep else dict.fromkeys(TABLES, 0)
         self._writer = None
         if tensorboard:
             from tensorboardX import SummaryWriter

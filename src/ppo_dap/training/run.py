@@ -21,7 +21,7 @@ from ppo_dap.methods import Method, get_method, resolve
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy, load_policy
 from ppo_dap.nets.storage import write_atomically
-from ppo_dap.priors.prior import DiffusionPrior, load_prior
+from ppo_dap.priors import DiffusionPrior, load_prior
 from ppo_dap.tasks import TaskSpec, describe
 from ppo_dap.training.algorithm import Frozen, Stages, create_learner
 from ppo_dap.training.manifest import manifest
@@ -57,6 +57,12 @@ class Run:
     def evaluations(self) -> list[dict[str, Any]]:
         """One row an evaluation point."""
         return read_table(self.folder, "evaluations")
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget was spent."""
+        rows = self.metrics
+        return bool(rows) and rows[-1]["env_steps"] >= self.config["config"]["steps"]
 
     def audit(self) -> list[audit.Claim]:
         """Definition 1, claim by claim: proved on the traced update, and measured in every iteration so far."""

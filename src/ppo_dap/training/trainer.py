@@ -96,9 +96,8 @@ class Trainer:
         clock, start = Stopwatch(), time.perf_counter()
         # 1) Rollout with the current policy and frozen statistics.
         rollout = self._collect(collector, clock)
-        state.reward_scale = state.reward_scale.update(
-            rollout.rewards, rollout.terminated | rollout.truncated, rollout.valid, ppo.gamma
-        )
+        valid, ended = np.asarray(rollout.valid), np.asarray(rollout.terminated | rollout.truncated)
+        state.reward_scale = state.reward_scale.update(np.asarray(rollout.rewards), ended, valid, ppo.gamma)
         # 2) to 6)
         key = jax.random.fold_in(jax.random.key(config.run.seed), state.iteration)
         state.learner, device_metrics = update(
@@ -106,11 +105,11 @@ class Trainer:
         )
         metrics = {name: float(value) for name, value in device_metrics.items()}
         self._guard(metrics)
-        state.observations = state.observations.update(rollout.observations[rollout.valid])
+        state.observations = state.observations.update(np.asarray(rollout.observations)[valid])
         state.iteration += 1
-        state.env_steps += int(rollout.valid.sum())
+        state.env_steps += int(valid.sum())
         self._apply_kl_rule(metrics["policy_kl"])
-        self._record(metrics, collector, int(rollout.valid.sum()), clock.seconds, time.perf_counter() - start)
+        self._record(metrics, collector, int(valid.sum()), clock.seconds, time.perf_counter() - start)
 
     def _collect(self, collector: Collector, clock: Stopwatch) -> Rollout:
         state, config = self.state, self.config

@@ -48,6 +48,7 @@ def warm_start(state: TrainState, logs: Logs, spec: TaskSpec, config: Config) ->
         reward_scale = _reward_scale(logs, config)
         for part, source in ((train, 0), (held_out, 1)):
             returns = logs.split(seed=config.run.seed)[source].returns_to_go(config.ppo.gamma)
+            assert returns is not None  # _reward_scale has checked
             part["returns"] = jnp.asarray(returns / reward_scale.std)
         critic = _fit(learner.ppo.critic, _critic_loss, train, held_out, config)
         learner = eqx.tree_at(lambda s: s.ppo.critic, learner, critic)

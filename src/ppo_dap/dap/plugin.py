@@ -1,0 +1,152 @@
+"""`Guide`: the method for any other PPO, through arrays alone."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from ppo_dap import config as configs
+from ppo_dap.dap.adaptation import steps_until
+from ppo_dap.dap.guidance import beta_schedule
+from ppo_dap.dap.guide import GuideState, adapt_prior, create_guide, learn_q, make_proposals
+from ppo_dap.dap.objective import Batch
+from ppo_dap.dap.proposals import Proposals
+from ppo_dap.errors import InputError
+from ppo_dap.nets.normalizer import RunningMoments
+from ppo_dap.nets.policy import scale_actions
+from ppo_dap.ppo.update import Rows
+from ppo_dap.priors import DiffusionPrior
+
+
+class Guide:
+    """Value-guided proposals of a prior for a PPO in any framework.
+
+    Call it once an iteration with the on-policy batch. It fits its own Q to the batch (one-step TD), adapts the prior
+    to it (PET), and returns `Proposals` on a random subset of the batch's states: arrays, so no gradient can pass. Add
+    `lambda_kl * KL(pi || N(proxy_mean, proxy_std)) + lambda_aux * mean(-log pi(actions))` to the policy's loss on those
+    states (Eq. 9), and nothing to ratios or advantages. Everything is in environment units.
+    """
+
+    def __init__(self, prior: DiffusionPrior, *, total_iterations: int, preset: str = "paper", **options: Any):
+        """`total_iterations` of the run, for the annealing of beta; `options` are fields of `Config` by name.
+
+        Q has a trunk of its own here, since this PPO's value network is not ours to read.
+        """
+        if total_iterations < 1:
+            raise InputError(f"total_iterations must be a number above 0, not {total_iterations}")
+        self.config = configs.make(preset, **(options | {"q_trunk": "separate"}))
+        self.prior, self.iteration, self._total = prior, 0, total_iterations
+        self._moments = RunningMoments.create(prior.observation_size)
+        self._rewards = RunningMoments.create(1)
+        key = jax.random.key(self.config.run.seed)
+        self._key, guide_key = jax.random.split(key)
+        sizes = (prior.observation_size, prior.action_size)
+        self._state = create_guide(guide_key, None, sizes, self.config, prior.denoiser)
+        self._propose = jax.jit(partial(make_proposals, config=self.config, diffusion=prior.config))
+        self._learn_q = jax.jit(partial(learn_q, config=self.config))
+        self._adapt = jax.jit(partial(adapt_prior, config=self.config, diffusion=prior.config))
+        self.metrics: dict[str, float] = {}
+        """Of the last call: ess, spr, q_loss, pet_loss, pet_spr, adapter_norm and others."""
+
+    def __call__(
+        self,
+        *,
+        observations: ArrayLike,
+        actions: ArrayLike,
+        rewards: ArrayLike,
+        next_values: ArrayLike,
+        terminated: ArrayLike,
+        valid: ArrayLike | None = None,
+    ) -> Proposals:
+        """Proposals for one on-policy batch of n rows.
+
+        observations (n, obs) raw; actions (n, act) as executed; rewards (n,); next_values (n,): this PPO's V at the
+        true next observations, in the rewards' units; terminated (n,) bool, False at truncations; valid (n,) bool,
+        False for rows in which no transition happened. `state_ids` of the result count the rows of this batch.
+
+        Raises `InputError` for arrays of other shapes or with NaN.
+        """
+        rows, batch = self._rows(observations, actions, rewards, next_values, terminated, valid)
+        progress = self.iteration / self._total
+        updates = self.config.ppo.num_epochs * len(rows.weights) // self.config.ppo.minibatch_size
+        keys = jax.random.split(jax.random.fold_in(self._key, self.iteration), 3)
+        beta = beta_schedule(progress, self.config.proposals.beta_max, self.config.proposals.beta_anneal)
+        denoiser, state = self.prior.denoiser, self._state
+        gated, spread, proposed = self._propose(
+            state, denoiser, None, rows, batch, jnp.asarray(beta, jnp.float32), keys[0]
+        )
+        q, _, q_optimizer, learned = self._learn_q(state, None, rows, keys[1])
+        frequency = self.config.adaptation.pet_frequency
+        due = [steps_until(i, frequency, updates) for i in (self.iteration, self.iteration + 1)]
+        adapters, optimizer, adapted = self._adapt(
+            state, denoiser, rows, batch, jnp.asarray(due[1] - due[0], jnp.int32), keys[2]
+        )
+        self._state = GuideState(q, q_optimizer, spread, adapters, optimizer)
+        self._moments = self._moments.update(np.asarray(rows.raw_observations)[np.asarray(rows.weights) > 0])
+        self.iteration += 1
+        self.metrics = {name: float(v) for name, v in (proposed | learned | adapted).items()}
+        return self._in_environment_units(gated.proposals)
+
+    def _rows(self, observations, actions, rewards, next_values, terminated, valid) -> tuple[Rows, Batch]:
+        prior, ppo = self.prior, self.config.ppo
+        observations = _checked("observations", observations, (None, prior.observation_size))
+        n = len(observations)
+        if n < ppo.minibatch_size:
+            raise InputError(f"a batch of {n} rows is smaller than minibatch_size {ppo.minibatch_size}")
+        if n % ppo.minibatch_size:
+            raise InputError(f"a batch of {n} rows must be a multiple of minibatch_size {ppo.minibatch_size}")
+        actions = _checked("actions", actions, (n, prior.action_size))
+        rewards, next_values = _checked("rewards", rewards, (n,)), _checked("next_values", next_values, (n,))
+        ended = _checked("terminated", terminated, (n,)) > 0
+        weights = np.ones(n, np.float32) if valid is None else _checked("valid", valid, (n,))
+        # Q's targets are scaled to spread 1, as PPO's scaled rewards would make them: guidance strengths mean the same.
+        targets = rewards + ppo.gamma * np.where(ended, 0.0, next_values)
+        self._rewards = self._rewards.update(targets[weights > 0][:, None])
+        normalised = np.clip((observations - self._moments.mean) / self._moments.std, -10.0, 10.0)
+        scaled = scale_actions(actions, prior.action_low, prior.action_high)
+        ids = jnp.arange(n, dtype=jnp.int32)
+        zeros = jnp.zeros(n)
+        rows = Rows(
+            state_ids=ids,
+            raw_observations=jnp.asarray(observations),
+            observations=jnp.asarray(normalised, jnp.float32),
+            actions=jnp.asarray(scaled, jnp.float32),
+            old_log_probs=zeros,
+            old_means=jnp.asarray(scaled, jnp.float32),
+            advantages=zeros,
+            returns=zeros,
+            q_targets=jnp.asarray(targets / float(self._rewards.std[0]), jnp.float32),
+            weights=jnp.asarray(weights),
+        )
+        return rows, Batch(ids[0], rows.raw_observations, rows.weights)
+
+    def _in_environment_units(self, proposals: Proposals) -> Proposals:
+        half = jnp.asarray((self.prior.action_high - self.prior.action_low) / 2)
+        centre = jnp.asarray((self.prior.action_high + self.prior.action_low) / 2)
+        mean, std, actions = proposals.proxy_mean, proposals.proxy_std, proposals.actions
+        return Proposals(
+            proposals.state_ids,
+            proposals.raw_observations,
+            proposals.raw_observations,
+            actions * half[None, None] + centre[None, None],
+            mean * half[None] + centre[None],
+            std * half[None],
+        )
+
+
+def _checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
+    """`value` as float32 of the given shape (None: any), or an `InputError` that says what is wrong with it."""
+    array = np.asarray(value, dtype=np.float32)
+    if array.ndim != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
+    ):
+        wanted = "(" + ", ".join("n" if want is None else str(want) for want in shape) + ")"
+        raise InputError(f"{name} has shape {array.shape}, should have {wanted}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} has NaN or infinite entries")
+    return array

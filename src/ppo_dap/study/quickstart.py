@@ -1,0 +1,110 @@
+"""The main job on the shipped sample: fit the prior, train PPO and PPO-DAP on paired seeds, show what the logs paid."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+from ppo_dap.errors import InputError, PPODAPError
+from ppo_dap.training.run import Run, load_run
+
+SAMPLE, TASK, STEPS, EPOCHS, SEEDS = "hopper-medium", "Hopper-v5", 200_000, 40, (0, 1)
+
+
+def quickstart(out: Path) -> bool:
+    """Run it in `out`, one process a core; returns whether every audit held. Takes a few minutes on two cores."""
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"out {out} is not empty: name a new folder, or remove it")
+    start = time.perf_counter()
+    prior = out / "prior"
+    print(f"Logs: the shipped sample {SAMPLE!r}. Task: {TASK}, {STEPS:,} steps a run. Everything goes to {out}.")
+    with ThreadPoolExecutor(max_workers=max(1, min(2, os.cpu_count() or 1))) as pool:
+        jobs = {("ppo", seed): pool.submit(_train, out, "ppo", seed, None) for seed in SEEDS[:1]}
+        fitted = pool.submit(_command, "pretrain", "--logs", SAMPLE, "--out", str(prior))
+        jobs |= {("ppo", seed): pool.submit(_train, out, "ppo", seed, None) for seed in SEEDS[1:]}
+        jobs |= {("ppo-dap", seed): pool.submit(_train, out, "ppo-dap", seed, (prior, fitted)) for seed in SEEDS}
+        for job in (fitted, *jobs.values()):
+            job.result()
+    runs = {key: load_run(_folder(out, *key)) for key in jobs}
+    holds = _print_summary(runs)
+    _draw(runs, out / "learning_curves.png")
+    print(f"\nLearning curves: {out / 'learning_curves.png'}   ({time.perf_counter() - start:.0f} s in all)")
+    return holds
+
+
+def _folder(out: Path, method: str, seed: int) -> Path:
+    return out / f"{method}-seed{seed}"
+
+
+def _train(out: Path, method: str, seed: int, prior: tuple[Path, Future] | None) -> None:
+    options = ["--task", TASK, "--method", method, "--steps", str(STEPS), "--seed", str(seed)]
+    if prior is not None:
+        prior[1].result()
+        options += ["--prior", str(prior[0]), "--preset", "tuned"]
+    _command("train", *options, "--out", str(_folder(out, method, seed)), "--quiet")
+    last = load_run(_folder(out, method, seed)).evaluations[-1]
+    print(f"  {method:8} seed {seed}: done, last return {last['return_mean']:,.0f}", flush=True)
+
+
+def _command(*arguments: str) -> None:
+    """One of our own commands in a process of its own, with one core."""
+    done = subprocess.run(
+        [sys.executable, "-m", "ppo_dap.cli", *arguments],
+        env=os.environ | {"NPROC": "1"},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        raise PPODAPError(f"`ppo-dap {' '.join(arguments)}` failed: {done.stderr.strip().splitlines()[-1]}")
+    if arguments[0] == "pretrain":
+        print(f"  {done.stdout.strip().splitlines()[-1]}", flush=True)
+
+
+def _print_summary(runs: dict[tuple[str, int], Run]) -> bool:
+    from rich.console import Console
+    from rich.table import Table
+
+    from ppo_dap.study.statistics import alc
+
+    table = Table(title=f"{TASK}, logs {SAMPLE}: what the logs paid")
+    for column in ("seed", "method", f"ALC@{EPOCHS}", "x PPO", "last return", "wall-clock", "audit"):
+        table.add_column(column, justify="left" if column in ("method", "audit") else "right")
+    all_hold = True
+    for seed in SEEDS:
+        base = alc(runs["ppo", seed].evaluations, EPOCHS)
+        for method in ("ppo", "ppo-dap"):
+            run = runs[method, seed]
+            value = alc(run.evaluations, EPOCHS)
+            holds = all(claim.holds for claim in run.audit())
+            all_hold &= holds
+            table.add_row(
+                str(seed),
+                method,
+                f"{value:,.0f}",
+                f"{value / base:.2f}",
+                f"{run.evaluations[-1]['return_mean']:,.0f}",
+                f"{_wall(run):.0f} s ({_wall(run) / _wall(runs['ppo', seed]):.2f}x)",
+                "strictly on-policy" if holds else "VIOLATED",
+            )
+    Console(width=100).print(table)
+    print("Audit details: ppo-dap audit " + str(runs["ppo-dap", SEEDS[0]].folder))
+    return all_hold
+
+
+def _wall(run: Run) -> float:
+    """Seconds of the training iterations, compilation in the first two and evaluations left out."""
+    rows: Sequence[dict] = run.metrics[2:]
+    return sum(sum(v for k, v in row.items() if k.startswith("seconds_")) for row in rows)
+
+
+def _draw(runs: dict[tuple[str, int], Run], path: Path) -> None:
+    from ppo_dap.study.figures import learning_curves
+
+    names = {"PPO": "ppo", "PPO-DAP (tuned)": "ppo-dap"}
+    groups = {label: [runs[method, seed] for seed in SEEDS] for label, method in names.items()}
+    learning_curves(groups, path, f"{TASK}: the same PPO with and without {SAMPLE} logs")

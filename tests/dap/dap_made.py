@@ -1,0 +1,121 @@
+"""A world small enough to trace and run in seconds: networks of width 8, 64 rows, K = 3."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import norm
+
+from ppo_dap.config import make
+from ppo_dap.dap.audit import Probe
+from ppo_dap.dap.objective import Weights
+from ppo_dap.nets.critic import QFunction
+from ppo_dap.nets.mlp import Linear
+from ppo_dap.ppo.rollout import Rollout
+from ppo_dap.ppo.update import Normaliser, Settings
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
+from ppo_dap.training import algorithm
+from ppo_dap.training.algorithm import Frozen, Schedule, Stages, create_learner
+
+OBS, ACT, TIME, ENVS = 3, 2, 16, 4
+ROWS = TIME * ENVS
+DIFFUSION = DiffusionConfig(width=8, depth=2)
+NORMALISER = Normaliser(jnp.zeros(OBS), jnp.ones(OBS), jnp.ones(()))
+_SMALL = {
+    "num_envs": ENVS, "rollout_steps": ROWS, "minibatch_size": 16, "num_epochs": 2, "hidden_size": 8,
+    "q_hidden_size": 8, "num_proposals": 3, "sampler_steps": 2, "pet_minibatch_size": 16, "adapter_rank": 2,
+    "proposal_fraction": 0.25,
+}  # fmt: skip
+
+
+def small_config(**options):
+    return make("paper", **{**_SMALL, **options})
+
+
+def small_denoiser():
+    return Denoiser.create(jax.random.key(5), DIFFUSION, jnp.zeros(OBS), jnp.ones(OBS), jnp.asarray(0.5), ACT)
+
+
+def small_frozen():
+    rng = np.random.default_rng(6)
+    rows = rng.standard_normal((16, OBS)), rng.uniform(-1, 1, (16, ACT))
+    return Frozen(small_denoiser(), Probe(*(jnp.asarray(r, jnp.float32) for r in rows)))
+
+
+def learner_of(config, guided=True):
+    return create_learner(jax.random.key(0), (OBS, ACT), config, small_denoiser() if guided else None)
+
+
+def rollout_of(actor, iteration=0):
+    """What a Collector would return in `iteration`; an eighth of the rows is masked, some steps end an episode."""
+    rng = np.random.default_rng(100 + iteration)
+    grid = (TIME, ENVS)
+    observations, successors = rng.standard_normal((2, *grid, OBS)).astype(np.float32)
+    means = np.asarray(actor(jnp.asarray(observations.reshape(ROWS, OBS)))).reshape(*grid, ACT)
+    std = np.exp(np.asarray(actor.log_std))
+    actions = means + std * rng.standard_normal(means.shape).astype(np.float32)
+    ended = rng.random(grid)
+    return Rollout(
+        state_ids=(np.arange(ROWS, dtype=np.int32) + ROWS * iteration).reshape(grid),
+        observations=observations,
+        next_observations=successors,
+        actions=actions,
+        log_probs=norm.logpdf(actions, means, std).sum(-1).astype(np.float32),
+        means=means,
+        rewards=rng.standard_normal(grid).astype(np.float32),
+        terminated=ended < 0.1,
+        truncated=ended > 0.9,
+        valid=rng.permutation(ROWS).reshape(grid) >= ROWS // 8,
+    )
+
+
+def schedule_of(iteration=0, lambda_kl=0.05, lambda_aux=0.1, guided=True, pet_steps=2):
+    numbers = [jnp.asarray(x, jnp.float32) for x in (3e-3, jnp.inf, lambda_kl, lambda_aux, 0.7)]
+    weights = Weights(*numbers[2:4]) if guided else ()
+    settings = Settings(*numbers[:2], weights)
+    return Schedule(jnp.asarray(iteration * ROWS, jnp.int32), settings, numbers[4], jnp.asarray(pet_steps, jnp.int32))
+
+
+def with_fault(fault):
+    """`update` in which `fault(name, stage, arguments, seen, frozen)` runs each stage and may tamper with it.
+
+    `seen` maps the names of the stages that ran before to their (arguments, result).
+    """
+
+    def faulty(learner, frozen, rollout, normaliser, schedule, key, stages):
+        seen = {"stages": stages, "rollout": rollout}
+        names = {id(stage): name for name, stage in vars(stages).items()}
+
+        def between(_, stage, *arguments):
+            name = names[id(stage)]
+            result = fault(name, stage, arguments, seen, frozen)
+            seen[name] = arguments, result
+            return result
+
+        return algorithm.update(learner, frozen, rollout, normaliser, schedule, key, stages, between)
+
+    return faulty
+
+
+def changed(node, **values):
+    """A copy of a module with some fields replaced."""
+    names = list(values)
+    return eqx.tree_at(lambda n: [getattr(n, name) for name in names], node, list(values.values()))
+
+
+def slope_q(slope, width=8, scale=1.0):
+    """Q(s, a) = scale * tanh(slope . a), whatever the state's features are."""
+    return QFunction(
+        None,
+        Linear(jnp.zeros((1, width)), jnp.zeros(1)),
+        Linear(jnp.asarray([slope], jnp.float32), jnp.zeros(1)),
+        Linear(jnp.asarray([[scale]], jnp.float32), jnp.zeros(1)),
+    )
+
+
+def bits(tree):
+    return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
+
+
+def new_stages(config):
+    return Stages(config, DIFFUSION)
