@@ -1,5 +1,7 @@
 """A world small enough to trace and run in seconds: networks of width 8, 64 rows, K = 3."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,8 +34,17 @@ def small_config(**options):
     return make("paper", **{**_SMALL, **options})
 
 
+def filled(create, seed, scale=0.5):
+    """The module that `create(key)` makes, with random numbers of spread `scale`: nothing to compile."""
+    shapes, rng = jax.eval_shape(create, jax.random.key(0)), np.random.default_rng(seed)
+    return jax.tree.map(lambda s: jnp.asarray(scale * rng.standard_normal(s.shape), jnp.float32), shapes)
+
+
+@functools.cache
 def small_denoiser():
-    return Denoiser.create(jax.random.key(5), DIFFUSION, jnp.zeros(OBS), jnp.ones(OBS), jnp.asarray(0.5), ACT)
+    moments = jnp.zeros(OBS), jnp.ones(OBS), jnp.asarray(0.5)
+    fresh = filled(lambda key: Denoiser.create(key, DIFFUSION, *moments, ACT), 5, 0.2)
+    return changed(fresh, observation_mean=moments[0], observation_std=moments[1], sigma_data=moments[2])
 
 
 def small_frozen():

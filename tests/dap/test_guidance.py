@@ -1,11 +1,10 @@
 """Eq. 7's weights and Eq. 8's drift, against numbers by hand and finite differences."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dap.dap_made import slope_q
+from dap.dap_made import filled, slope_q
 from ppo_dap.config import ProposalConfig
 from ppo_dap.dap.guidance import (
     alpha_schedule,
@@ -20,7 +19,7 @@ from ppo_dap.dap.guidance import (
 from ppo_dap.dap.proposals import q_drift
 from ppo_dap.nets.critic import QFunction
 
-ALL = jnp.ones((1, 3), bool)
+NOISE = jnp.asarray(np.random.default_rng(2).standard_normal((5, 3, 6)), jnp.float32)
 
 
 def f32(*values):
@@ -92,8 +91,8 @@ def test_alpha_schedule():
 
 @pytest.mark.parametrize("own_trunk", [False, True])
 def test_drift_is_alpha_times_the_finite_difference_gradient_of_q(own_trunk):
-    q = QFunction.create(jax.random.key(0), 3, 2, 4, 8, own_trunk)
-    features, x = jax.random.normal(jax.random.key(1), (5, 4)), jax.random.normal(jax.random.key(2), (5, 3, 2))
+    q = filled(lambda key: QFunction.create(key, 3, 2, 4, 8, own_trunk), 0)
+    features, x = NOISE[:, 0, :4], NOISE[..., 4:]
     drift = np.asarray(q_drift(q, features, 5.0, ProposalConfig(guidance_cap=100.0))(x, jnp.float32(2.0)))
     step = 1e-2
     for d in range(2):
@@ -107,8 +106,8 @@ def test_drift_is_alpha_times_the_finite_difference_gradient_of_q(own_trunk):
 def test_cap_bounds_what_it_says(cap_on, longest):
     """Q's slope is 5 and more: with the cap on the step it has norm c, with the cap on the gradient alpha_t c."""
     config = ProposalConfig(cap_on=cap_on)
-    drift = q_drift(slope_q([3.0, -4.0], scale=2.0), jnp.zeros((6, 8)), 5.0, config)
-    x = 0.01 * jax.random.normal(jax.random.key(0), (6, 3, 2))
+    drift = q_drift(slope_q([3.0, -4.0], scale=2.0), jnp.zeros((5, 8)), 5.0, config)
+    x = 0.01 * NOISE[..., :2]
     pushes = np.asarray(drift(x, jnp.float32(2.0)))
     np.testing.assert_allclose(np.linalg.norm(pushes, axis=-1), longest, rtol=1e-4)
     np.testing.assert_allclose(pushes / longest, np.broadcast_to([0.6, -0.8], pushes.shape), rtol=1e-4)

@@ -8,9 +8,8 @@ from ppo_dap.errors import InputError
 from ppo_dap.nets.adapters import Adapters, LoRA, adapter_norm, init_adapters, merge
 from ppo_dap.nets.mlp import MLP
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, denoising_loss
-from ppo_dap.priors.samplers import sample_actions
 
-CONFIG = DiffusionConfig(width=32, depth=2, sampler_steps=5)
+CONFIG = DiffusionConfig(width=32, depth=2)
 KINDS = ["lora", "bottleneck"]
 
 
@@ -42,15 +41,6 @@ def adapted(denoiser, kind, steps, learning_rate=1e-2):
     return adapters
 
 
-def samples(denoiser, adapters):
-    return np.asarray(_samples(denoiser, adapters))
-
-
-@jax.jit
-def _samples(denoiser, adapters):
-    return sample_actions(denoiser, adapters, *rows()[:2], jax.random.key(3), 4, CONFIG)[0]
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_adapters_start_as_an_exact_identity(denoiser, kind):
     adapters = init_adapters(jax.random.key(2), denoiser, kind, 4)
@@ -59,7 +49,8 @@ def test_adapters_start_as_an_exact_identity(denoiser, kind):
     forward = jax.jit(lambda d, x, e, sigma, a: d(x, e, sigma, a))
     inputs = denoiser, x, embedding, jnp.asarray(0.3)
     np.testing.assert_array_equal(forward(*inputs, adapters), forward(*inputs, None))
-    np.testing.assert_array_equal(samples(denoiser, adapters), samples(denoiser, None))
+    merged, _ = merge(denoiser, adapters)
+    assert all(np.array_equal(m.weight, w.weight) for m, w in zip(merged.hidden, denoiser.hidden, strict=True))
     assert float(adapter_norm(adapters)) == 0
 
 
@@ -73,11 +64,11 @@ def test_one_factor_learns_at_once_and_both_after_one_step(denoiser, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_pet_lowers_its_loss_and_moves_the_samples(denoiser, kind):
+def test_pet_lowers_its_loss(denoiser, kind):
     start, end = (adapted(denoiser, kind, steps) for steps in (0, 60))
     before, after = (float(loss_and_gradient(a, denoiser, jax.random.key(99))[0]) for a in (start, end))
     assert after < 0.97 * before
-    assert np.abs(samples(denoiser, end) - samples(denoiser, None)).max() > 1e-3
+    assert float(adapter_norm(end)) > 0.01
 
 
 def test_merged_lora_is_the_same_network(denoiser):

@@ -13,18 +13,18 @@ from truths import TwoModes
 from ppo_dap.logs import Logs
 from ppo_dap.priors.fit import Rows, fit_prior, train_denoiser
 
-SMALL = {"width": 64, "depth": 1, "batch_size": 256, "max_steps": 2000, "chunk_steps": 250, "ema_decay": 0.99}
+SMALL = {"width": 64, "depth": 1, "batch_size": 256, "max_steps": 1500, "chunk_steps": 250, "ema_decay": 0.99}
 
 
-def two_mode_logs(rows=20_000, **fields):
+def two_mode_logs(rows=20_000):
     rng = np.random.default_rng(0)
     states = rng.uniform(-1, 1, (rows, 2))
     actions = TwoModes().sample(states, 1, rng)[:, 0]
-    bounds = {"action_low": np.array([-2.0, 0.0]), "action_high": np.array([2.0, 1.0])}
     # The environment's units: the first dimension in [-2, 2], the second in [0, 1].
     units = actions * np.array([2.0, 0.5]) + np.array([0.0, 0.5])
     ends = np.arange(1, rows + 1) % 100 == 0
-    return Logs(observations=states, actions=units, episode_ends=ends, **{**bounds, "task": "Toy-v0", **fields})
+    bounds = {"action_low": np.array([-2.0, 0.0]), "action_high": np.array([2.0, 1.0])}
+    return Logs(observations=states, actions=units, episode_ends=ends, task="Toy-v0", **bounds)
 
 
 @pytest.fixture(scope="session")

@@ -1,10 +1,11 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths import TwoModes, energy, moment_matched
 
-from conftest import SMALL, two_mode_logs
 from ppo_dap.errors import InputError, TrainingDiverged
 from ppo_dap.priors import fit
 from ppo_dap.priors.diffusion import DiffusionConfig
@@ -19,8 +20,6 @@ def in_scaled_units(actions):
 
 @pytest.mark.parametrize("sampler", ["ancestral", "dpmpp_2m"])
 def test_fitted_prior_has_the_distribution_of_the_logs(prior, sampler):
-    import dataclasses
-
     states = np.array([[0.3, -0.6], [-0.5, 0.5], [0.8, 0.1]])
     chosen = dataclasses.replace(prior, config=dataclasses.replace(prior.config, sampler=sampler))
     samples = in_scaled_units(chosen.sample(states, jax.random.key(0), 1000))
@@ -76,7 +75,7 @@ def scripted(monkeypatch, losses):
 
     monkeypatch.setattr(fit, "train_chunk", chunk)
     rows = Rows(jnp.ones((40, 1)), jnp.zeros((40, 0)), jnp.ones((40, 1)))
-    config = DiffusionConfig(**{**QUICK, "max_steps": 80}, patience=3)
+    config = DiffusionConfig(**{**QUICK, "max_steps": 80, "patience": 3})
     return train_denoiser(rows, rows, config, jax.random.key(0)), calls
 
 
@@ -94,19 +93,19 @@ def test_a_fit_that_diverges_says_when(monkeypatch):
         scripted(monkeypatch, [1.0, float("nan")])
 
 
-def test_constant_observations_and_actions_outside_the_bounds():
+def test_constant_observations_and_actions_outside_the_bounds(logs):
     rng = np.random.default_rng(0)
-    states = np.stack([rng.standard_normal(200), np.full(200, 7.0)], axis=1)
-    logs = two_mode_logs(200, observations=states, actions=rng.uniform(-9, 9, (200, 2)))
-    prior = fit_prior(logs, **QUICK)
+    states = np.stack([rng.standard_normal(len(logs.actions)), np.full(len(logs.actions), 7.0)], axis=1)
+    odd = dataclasses.replace(logs, observations=states, actions=rng.uniform(-9, 9, logs.actions.shape))
+    prior = fit_prior(odd, **QUICK)
     np.testing.assert_allclose(prior.denoiser.observation_mean[1], 7.0)
     assert float(prior.denoiser.observation_std[1]) == 1.0
     assert np.abs(prior.probe_actions).max() == 1.0
     assert np.all(np.isfinite(prior.sample(states[:4], jax.random.key(0), 3)))
 
 
-def test_bounds_from_the_options():
-    logs = two_mode_logs(200, action_low=None, action_high=None)
+def test_bounds_from_the_options(logs):
+    logs = dataclasses.replace(logs, action_low=None, action_high=None)
     with pytest.raises(InputError, match="pass action_low and action_high"):
         fit_prior(logs, **QUICK)
     prior = fit_prior(logs, action_low=-3.0, action_high=[3.0, 2.0], **QUICK)
@@ -124,7 +123,3 @@ def test_unknown_names_are_refused(logs):
         fit_prior(logs, lerning_rate=1e-3)
     with pytest.raises(InputError, match="num_conditions must be 0"):
         fit_prior(logs, num_conditions=1)
-
-
-def test_small_fixture_settings_are_valid():
-    DiffusionConfig(**SMALL)

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -190,7 +192,10 @@ def test_states_are_embedded_once_and_noise_drawn_once(sampler):
     products = [(e, loop) for e, loop in equations if e.primitive.name == "dot_general"]
     of_states = [loop for e, loop in products if e.invars[0].aval.shape[0] == 7 and e.invars[0].aval.ndim == 2]
     assert of_states == [False, False]  # the two layers of the state network, outside the loop
-    assert [loop for e, loop in products if e.invars[0].aval.ndim == 3] == [True, True, True, True]  # one step's layers
+    of_actions = [loop for e, loop in products if e.invars[0].aval.ndim == 3]
+    once = 3 * (sampler == "dpmpp_2m")  # a network of three layers; the deterministic solver centres its start first
+    assert of_actions.count(False) == once
+    assert of_actions.count(True) == 3
     draws = [loop for e, loop in equations if e.primitive.name == "random_bits"]
     assert draws == [False]
 
@@ -199,6 +204,7 @@ def test_sample_actions_repeats_under_the_same_key_only():
     denoiser = small_denoiser()
     observations, condition = jnp.ones((4, 3)), jnp.zeros((4, 0))
 
+    @partial(jax.jit, static_argnames=("sampler", "num_steps"))
     def run(seed, **options):
         return sample_actions(denoiser, None, observations, condition, jax.random.key(seed), 6, CONFIG, **options)[0]
 

@@ -6,11 +6,11 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from ppo_dap.errors import InputError, PPODAPError
+from ppo_dap.study.summary import print_summary, summarise
 from ppo_dap.training.run import Run, load_run
 
 SAMPLE, TASK, STEPS, EPOCHS, SEEDS = "hopper-medium", "Hopper-v5", 200_000, 40, (0, 1)
@@ -31,10 +31,12 @@ def quickstart(out: Path) -> bool:
         for job in (fitted, *jobs.values()):
             job.result()
     runs = {key: load_run(_folder(out, *key)) for key in jobs}
-    holds = _print_summary(runs)
+    rows = summarise([runs[method, seed] for seed in SEEDS for method in ("ppo", "ppo-dap")], EPOCHS)
+    print_summary(rows, EPOCHS, f"{TASK}, logs {SAMPLE}: what the logs paid")
+    print(f"Audit, clause by clause: ppo-dap audit {runs['ppo-dap', SEEDS[0]].folder}")
     _draw(runs, out / "learning_curves.png")
     print(f"\nLearning curves: {out / 'learning_curves.png'}   ({time.perf_counter() - start:.0f} s in all)")
-    return holds
+    return all(row["audit"] for row in rows)
 
 
 def _folder(out: Path, method: str, seed: int) -> Path:
@@ -63,43 +65,6 @@ def _command(*arguments: str) -> None:
         raise PPODAPError(f"`ppo-dap {' '.join(arguments)}` failed: {done.stderr.strip().splitlines()[-1]}")
     if arguments[0] == "pretrain":
         print(f"  {done.stdout.strip().splitlines()[-1]}", flush=True)
-
-
-def _print_summary(runs: dict[tuple[str, int], Run]) -> bool:
-    from rich.console import Console
-    from rich.table import Table
-
-    from ppo_dap.study.statistics import alc
-
-    table = Table(title=f"{TASK}, logs {SAMPLE}: what the logs paid")
-    for column in ("seed", "method", f"ALC@{EPOCHS}", "x PPO", "last return", "wall-clock", "audit"):
-        table.add_column(column, justify="left" if column in ("method", "audit") else "right")
-    all_hold = True
-    for seed in SEEDS:
-        base = alc(runs["ppo", seed].evaluations, EPOCHS)
-        for method in ("ppo", "ppo-dap"):
-            run = runs[method, seed]
-            value = alc(run.evaluations, EPOCHS)
-            holds = all(claim.holds for claim in run.audit())
-            all_hold &= holds
-            table.add_row(
-                str(seed),
-                method,
-                f"{value:,.0f}",
-                f"{value / base:.2f}",
-                f"{run.evaluations[-1]['return_mean']:,.0f}",
-                f"{_wall(run):.0f} s ({_wall(run) / _wall(runs['ppo', seed]):.2f}x)",
-                "strictly on-policy" if holds else "VIOLATED",
-            )
-    Console(width=100).print(table)
-    print("Audit details: ppo-dap audit " + str(runs["ppo-dap", SEEDS[0]].folder))
-    return all_hold
-
-
-def _wall(run: Run) -> float:
-    """Seconds of the training iterations, compilation in the first two and evaluations left out."""
-    rows: Sequence[dict] = run.metrics[2:]
-    return sum(sum(v for k, v in row.items() if k.startswith("seconds_")) for row in rows)
 
 
 def _draw(runs: dict[tuple[str, int], Run], path: Path) -> None:

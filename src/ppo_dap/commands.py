@@ -1,0 +1,193 @@
+"""What each command does with its parsed options: one call of a public function, and its result in words or JSON."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from ppo_dap import config as configs
+from ppo_dap.errors import InputError
+
+
+def _set_up() -> None:
+    """What must happen before JAX is imported."""
+    from ppo_dap.training.manifest import set_core_count
+
+    set_core_count()
+
+
+def quickstart(options: argparse.Namespace) -> int:
+    """The main job on the shipped sample."""
+    _set_up()
+    from ppo_dap.study.quickstart import quickstart
+
+    return 0 if quickstart(Path(options.out)) else 1
+
+
+def check_logs(options: argparse.Namespace) -> int:
+    """The verdict on logs; exit code 0, 1 (warnings) or 2 (unusable)."""
+    from ppo_dap import logs as logs_package
+
+    logs = logs_package.load_logs(options.logs, options.task)
+    against: dict[str, Any] = {}
+    if logs.task is not None:
+        from ppo_dap.tasks import describe
+
+        spec = describe(logs.task)
+        against = {"action_low": spec.action_low, "action_high": spec.action_high}
+        against["observation_size"] = spec.observation_size
+    report = logs_package.check_logs(logs, **against)
+    if options.json:
+        print(json.dumps([dataclasses.asdict(finding) for finding in report.lines]))
+    else:
+        print(report)
+    return report.exit_code
+
+
+def pretrain(options: argparse.Namespace) -> int:
+    """Stage I."""
+    _set_up()
+    from ppo_dap.logs import load_logs
+    from ppo_dap.priors import fit_prior
+
+    logs = load_logs(options.logs, options.task)
+    bounds: dict[str, Any] = {}
+    if logs.action_low is None and logs.task is not None:
+        from ppo_dap.tasks import describe
+
+        spec = describe(logs.task)
+        bounds = {"action_low": spec.action_low, "action_high": spec.action_high}
+
+    def show(p: Any) -> None:
+        print(
+            f"step {p.step:,}/{p.max_steps:,}: loss {p.train_loss:.4f}, held out {p.validation_loss:.4f}, "
+            f"{p.seconds:.0f} s",
+            file=sys.stderr,
+        )
+
+    prior = fit_prior(logs, seed=options.seed, progress=None if options.quiet else show, **bounds)
+    prior.save(options.out)
+    summary = prior.training
+    print(
+        f"prior {options.out}: {summary['rows']:,} rows of {logs.num_episodes} episodes, {summary['steps']:,} steps in "
+        f"{summary['seconds']:.0f} s, held-out loss {summary['validation_loss']:.4f}"
+    )
+    return 0
+
+
+def train_run(options: argparse.Namespace) -> int:
+    """Stage II."""
+    _set_up()
+    given = {name: value for name, value in vars(options).items() if name in configs.field_groups()}
+    configs.make(options.preset, **given)  # a bad option is told before JAX is imported
+    from ppo_dap.training.run import train
+
+    run = train(
+        options.task,
+        options.method,
+        prior=options.prior,
+        logs=options.logs,
+        out=options.out,
+        preset=options.preset,
+        resume=options.resume,
+        progress=not options.quiet,
+        **given,
+    )
+    last = run.evaluations[-1]
+    violated = [claim for claim in run.audit() if not claim.holds]
+    if not run.finished:
+        print(f"{options.out}: stopped at {run.metrics[-1]['env_steps']:,} steps; go on with --resume", file=sys.stderr)
+    if options.json:
+        print(json.dumps(last | {"audit": not violated}))
+    else:
+        print(
+            f"{options.out}: {last['env_steps']:,} steps, return {last['return_mean']:,.1f} over {last['episodes']} "
+            f"episodes, audit {'VIOLATED: see `ppo-dap audit`' if violated else 'holds'}"
+        )
+    return 1 if violated or not run.finished else 0
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Returns of a run's deterministic policy."""
+    _set_up()
+    from ppo_dap.training.evaluation import evaluate_policy
+    from ppo_dap.training.run import load_run
+
+    if options.episodes < 1:
+        raise InputError(f"--episodes must be a number above 0, not {options.episodes}")
+    run = load_run(options.folder)
+    task = options.task or run.config["task"]
+    row = evaluate_policy(run.policy, task, options.episodes, options.seed).row(run.evaluations[-1]["env_steps"])
+    if options.json:
+        print(json.dumps(row))
+    else:
+        print(
+            f"{task}: return {row['return_mean']:,.1f} +- {row['return_std']:,.1f} over {row['episodes']} episodes, "
+            f"length {row['length_mean']:,.0f}"
+        )
+    return 0
+
+
+def audit(options: argparse.Namespace) -> int:
+    """The verdict on a run; exit code 1 on a violation."""
+    from ppo_dap.training.run import load_run
+
+    claims = load_run(options.folder).audit()
+    violated = [claim for claim in claims if not claim.holds]
+    if options.json:
+        print(json.dumps([dataclasses.asdict(claim) for claim in claims]))
+    else:
+        print("\n".join(map(str, claims)))
+        print(f"verdict: {'NOT strictly on-policy' if violated else 'strictly on-policy (Definition 1)'}")
+    return 1 if violated else 0
+
+
+def summary(options: argparse.Namespace) -> int:
+    """Runs side by side."""
+    from ppo_dap.study.summary import print_summary, summarise
+    from ppo_dap.training.run import load_run
+
+    rows = summarise([load_run(folder) for folder in options.folders], options.epochs)
+    if options.json:
+        print(json.dumps(rows))
+    else:
+        print_summary(rows, options.epochs)
+    return 0 if all(row["audit"] for row in rows) else 1
+
+
+def collect(options: argparse.Namespace) -> int:
+    """Logs of a run's policy."""
+    _set_up()
+    from ppo_dap.logs import save_npz
+    from ppo_dap.training.collect import collect_logs
+    from ppo_dap.training.run import load_run
+
+    run = load_run(options.folder)
+    logs = collect_logs(run.policy, run.config["task"], options.steps, options.seed, noise=options.noise)
+    save_npz(logs, options.out)
+    summary = logs.episode_returns()
+    assert summary is not None  # collected logs have rewards
+    print(
+        f"{options.out}: {logs.num_rows:,} rows, {logs.num_episodes} episodes, return {summary.mean():,.0f}, "
+        f"sha256 {logs.hash()}"
+    )
+    return 0
+
+
+def methods(options: argparse.Namespace) -> int:
+    """The capability matrix."""
+    from ppo_dap.methods import ALIASES, capability_rows
+
+    rows = capability_rows()
+    if options.json:
+        print(json.dumps(rows))
+        return 0
+    widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in rows[0]}
+    for row in ({name: name for name in widths}, *rows):
+        print("  ".join(row[name].ljust(width) for name, width in widths.items()).rstrip())
+    print("also known as: " + ", ".join(f"{alias} = {name}" for alias, name in ALIASES.items()))
+    return 0

@@ -1,0 +1,79 @@
+"""One row for each run of a set: what it learned, what it cost, whether it was fair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ppo_dap.study.statistics import EPOCH, alc
+from ppo_dap.training.run import Run
+
+COMPILED_AFTER = 2
+"""Iterations in which programs are compiled; they do not count as cost."""
+
+
+def summarise(runs: Sequence[Run], epochs: float = 40) -> list[dict[str, Any]]:
+    """A row a run; `x_ppo` and `wall_x_ppo` compare it with the plain PPO run of the same task, seed and steps."""
+    rows = [_row(run, epochs) for run in runs]
+    base = {_pair(row): row for row in rows if row["method"] == "ppo"}
+    for row in rows:
+        ppo = base.get(_pair(row))
+        row["x_ppo"] = row["alc"] / ppo["alc"] if ppo and ppo["alc"] and row["alc"] is not None else None
+        row["wall_x_ppo"] = row["seconds"] / ppo["seconds"] if ppo else None
+    return rows
+
+
+def _pair(row: dict[str, Any]) -> tuple:
+    return row["task"], row["seed"], row["steps"]
+
+
+def _row(run: Run, epochs: float) -> dict[str, Any]:
+    evaluations, config = run.evaluations, run.config["config"]
+    reached = evaluations[-1]["env_steps"] >= epochs * EPOCH
+    return {
+        "run": str(run.folder),
+        "task": run.config["task"],
+        "method": run.config["method"],
+        "preset": run.config["preset"],
+        "warm_start": config["warm_start"],
+        "seed": config["seed"],
+        "steps": config["steps"],
+        "alc": alc(evaluations, epochs) if reached else None,
+        "last_return": evaluations[-1]["return_mean"],
+        "seconds": sum(
+            value for row in run.metrics[COMPILED_AFTER:] for name, value in row.items() if name.startswith("seconds_")
+        ),
+        "audit": all(claim.holds for claim in run.audit()),
+    }
+
+
+def print_summary(rows: Sequence[dict[str, Any]], epochs: float, title: str | None = None) -> None:
+    """The rows as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title)
+    for column in ("task", "seed", "method", f"ALC@{epochs:g}", "x PPO", "last return", "training", "x PPO", "audit"):
+        table.add_column(column, justify="left" if column in ("task", "method", "audit") else "right", no_wrap=True)
+
+    def number(value: float | None, digits: int) -> str:
+        return "-" if value is None else f"{value:,.{digits}f}"
+
+    for row in rows:
+        method = (
+            row["method"]
+            if row["preset"] == "paper" or row["method"] == "ppo"
+            else f"{row['method']} ({row['preset']})"
+        )
+        table.add_row(
+            row["task"],
+            str(row["seed"]),
+            method,
+            number(row["alc"], 0),
+            number(row["x_ppo"], 2),
+            number(row["last_return"], 0),
+            number(row["seconds"], 0) + " s",
+            number(row["wall_x_ppo"], 2),
+            "strictly on-policy" if row["audit"] else "VIOLATED",
+        )
+    Console(width=120).print(table)
