@@ -13,6 +13,7 @@ import typing
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
+from ppo_dap import commands
 from ppo_dap import config as configs
 from ppo_dap.errors import InputError, PPODAPError, unknown
 
