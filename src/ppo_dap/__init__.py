@@ -43,7 +43,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'ppo_dap' has no attribute {name!r}")
     module, attribute = _SOURCES[name]
     if module not in ("errors", "logs", "methods"):
-        from ppo_dap.training.manifest import set_core_count
+        from ppo_dap.training.manifest import prepare_jax
 
-        set_core_count()
+        prepare_jax()
     return getattr(importlib.import_module(f"ppo_dap.{module}"), attribute)

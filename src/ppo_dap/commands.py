@@ -11,18 +11,12 @@ from typing import Any
 
 from ppo_dap import config as configs
 from ppo_dap.errors import InputError
-
-
-def _set_up() -> None:
-    """What must happen before JAX is imported."""
-    from ppo_dap.training.manifest import set_core_count
-
-    set_core_count()
+from ppo_dap.training.manifest import prepare_jax
 
 
 def quickstart(options: argparse.Namespace) -> int:
     """The main job on the shipped sample."""
-    _set_up()
+    prepare_jax()
     from ppo_dap.study.quickstart import quickstart
 
     return 0 if quickstart(Path(options.out)) else 1
@@ -50,7 +44,7 @@ def check_logs(options: argparse.Namespace) -> int:
 
 def pretrain(options: argparse.Namespace) -> int:
     """Stage I."""
-    _set_up()
+    prepare_jax()
     from ppo_dap.logs import load_logs
     from ppo_dap.priors import fit_prior
 
@@ -81,7 +75,7 @@ def pretrain(options: argparse.Namespace) -> int:
 
 def train_run(options: argparse.Namespace) -> int:
     """Stage II."""
-    _set_up()
+    prepare_jax()
     given = {name: value for name, value in vars(options).items() if name in configs.field_groups()}
     configs.make(options.preset, **given)  # a bad option is told before JAX is imported
     from ppo_dap.training.run import train
@@ -113,7 +107,7 @@ def train_run(options: argparse.Namespace) -> int:
 
 def evaluate(options: argparse.Namespace) -> int:
     """Returns of a run's deterministic policy."""
-    _set_up()
+    prepare_jax()
     from ppo_dap.training.evaluation import evaluate_policy
     from ppo_dap.training.run import load_run
 
@@ -161,7 +155,7 @@ def summary(options: argparse.Namespace) -> int:
 
 def collect(options: argparse.Namespace) -> int:
     """Logs of a run's policy."""
-    _set_up()
+    prepare_jax()
     from ppo_dap.logs import save_npz
     from ppo_dap.training.collect import collect_logs
     from ppo_dap.training.run import load_run

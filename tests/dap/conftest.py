@@ -1,6 +1,6 @@
 import pytest
 
-from dap.dap_made import learner_of, new_stages, small_config, small_frozen
+from dap.dap_made import learner_of, quick_stages, small_config, small_frozen
 
 
 @pytest.fixture(scope="session")
@@ -21,4 +21,4 @@ def learner(config):
 @pytest.fixture(scope="session")
 def stages(config):
     """Compiled once; a test that patches what a stage is made of builds its own."""
-    return new_stages(config)
+    return quick_stages(config)

@@ -66,7 +66,7 @@ def rollout_of(actor, iteration=0):
     std = np.exp(np.asarray(actor.log_std))
     actions = means + std * rng.standard_normal(means.shape).astype(np.float32)
     ended = rng.random(grid)
-    return Rollout(
+    arrays = dict(
         state_ids=(np.arange(ROWS, dtype=np.int32) + ROWS * iteration).reshape(grid),
         observations=observations,
         next_observations=successors,
@@ -78,12 +78,13 @@ def rollout_of(actor, iteration=0):
         truncated=ended > 0.9,
         valid=rng.permutation(ROWS).reshape(grid) >= ROWS // 8,
     )
+    return Rollout(**{name: jnp.asarray(array) for name, array in arrays.items()})
 
 
 def schedule_of(iteration=0, lambda_kl=0.05, lambda_aux=0.1, guided=True, pet_steps=2):
     numbers = [jnp.asarray(x, jnp.float32) for x in (3e-3, jnp.inf, lambda_kl, lambda_aux, 0.7)]
     weights = Weights(*numbers[2:4]) if guided else ()
-    settings = Settings(*numbers[:2], weights)
+    settings = Settings(*numbers[:2], jnp.asarray(guided), weights)
     return Schedule(jnp.asarray(iteration * ROWS, jnp.int32), settings, numbers[4], jnp.asarray(pet_steps, jnp.int32))
 
 
@@ -128,5 +129,15 @@ def bits(tree):
     return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
 
 
-def new_stages(config):
-    return Stages(config, DIFFUSION)
+def quick_jit(function, **options):
+    """`jax.jit` that spends less on optimising what runs once or twice."""
+    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0}, **options)
+
+
+def quick_stages(config):
+    """The stages of a run; those in which no bit is compared are compiled quickly."""
+    stages = Stages(config, DIFFUSION)
+    for name, stage in vars(stages).items():
+        if name not in ("actor", "critic"):
+            setattr(stages, name, quick_jit(stage.__wrapped__))
+    return stages

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dap.dap_made import filled, slope_q
+from dap.dap_made import filled, quick_jit, slope_q
 from ppo_dap.config import ProposalConfig
 from ppo_dap.dap.guidance import (
     alpha_schedule,
@@ -93,11 +93,13 @@ def test_alpha_schedule():
 def test_drift_is_alpha_times_the_finite_difference_gradient_of_q(own_trunk):
     q = filled(lambda key: QFunction.create(key, 3, 2, 4, 8, own_trunk), 0)
     features, x = NOISE[:, 0, :4], NOISE[..., 4:]
-    drift = np.asarray(q_drift(q, features, 5.0, ProposalConfig(guidance_cap=100.0))(x, jnp.float32(2.0)))
+    config = ProposalConfig(guidance_cap=100.0)
+    drift = np.asarray(quick_jit(lambda x: q_drift(q, features, 5.0, config)(x, jnp.float32(2.0)))(x))
+    value = quick_jit(lambda x: q(features, x))
     step = 1e-2
     for d in range(2):
         shift = step * jnp.broadcast_to(jnp.eye(2)[d], x.shape)
-        slope = (np.asarray(q(features, x + shift)) - np.asarray(q(features, x - shift))) / (2 * step)
+        slope = np.asarray(value(x + shift) - value(x - shift)) / (2 * step)
         np.testing.assert_allclose(drift[..., d], 0.3 * (1 - 2.0 / 5.0) * slope, atol=2e-4)
     assert np.abs(drift).max() > 0.02
 

@@ -97,7 +97,10 @@ def constant_reward(terminated, truncated):
     ones, shape = np.ones((12, 2), np.float32), (12, 2)
     value = ones / (1 - GAMMA)
     ends = np.arange(1, 13)[:, None] % 4 == 0
-    flags = {"terminated": np.broadcast_to(ends & terminated, shape), "truncated": np.broadcast_to(ends & truncated, shape)}
+    flags = {
+        "terminated": np.broadcast_to(ends & terminated, shape),
+        "truncated": np.broadcast_to(ends & truncated, shape),
+    }
     return {"rewards": ones, "values": value, "next_values": value, "valid": np.ones(shape, bool), **flags}
 
 

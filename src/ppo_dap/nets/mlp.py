@@ -35,8 +35,9 @@ class Linear(eqx.Module):
     @staticmethod
     def lecun_normal(key: PRNGKeyArray, in_size: int, out_size: int, gain: float = 1.0) -> Linear:
         """A layer whose output has `gain` times the spread of its input."""
-        init = jax.nn.initializers.lecun_normal(in_axis=-1, out_axis=-2)
-        return Linear(gain * init(key, (out_size, in_size), jnp.float32), jnp.zeros(out_size, jnp.float32))
+        # Not jax.nn.initializers.lecun_normal: it truncates the normal, which takes seconds to compile over a network.
+        weight = jax.random.normal(key, (out_size, in_size), jnp.float32) * (gain / in_size**0.5)
+        return Linear(weight, jnp.zeros(out_size, jnp.float32))
 
     def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
         """Apply the layer to the last axis."""

@@ -20,8 +20,8 @@ FORMAT = 1
 class Policy:
     """A Gaussian policy with its observation normaliser and action scaling inside."""
 
-    weights: tuple[Float[np.ndarray, "out in"], ...]
-    biases: tuple[Float[np.ndarray, " out"], ...]
+    weights: tuple[Float[np.ndarray, "_ _"], ...]
+    biases: tuple[Float[np.ndarray, " _"], ...]
     log_std: Float[np.ndarray, " act"]
     observation_mean: Float[np.ndarray, " obs"]
     observation_std: Float[np.ndarray, " obs"]
@@ -38,7 +38,7 @@ class Policy:
             hidden = np.tanh(hidden @ weight.T + bias)
         return hidden @ self.weights[-1].T + self.biases[-1]
 
-    def log_prob_of_noise(self, noise: Float[np.ndarray, "n act"]) -> Float[np.ndarray, " n"]:
+    def log_prob_of_noise(self, noise: Float[np.ndarray, "*n act"]) -> Float[np.ndarray, "*n"]:
         """Log-density of mean + std * noise."""
         constant = self.log_std.sum() + 0.5 * math.log(2 * math.pi) * len(self.log_std)
         return -0.5 * np.square(noise).sum(-1) - np.float32(constant)

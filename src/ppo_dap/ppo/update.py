@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ppo_dap.config import PPOConfig
 from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
@@ -127,12 +127,19 @@ AddedGradient = Callable[[Actor, Any, Any], tuple[Actor, dict[str, Float[Array, 
 """(actor, minibatch of what the method adds, its weights) -> gradient to add to PPO's, and metrics."""
 
 
+def nothing_to_add(actor: Actor, minibatch: Any, weights: Any) -> tuple[Actor, dict[str, Float[Array, ""]]]:
+    """Stands for `added_gradient` in plain PPO, whose `Settings.adds` is False: never called on numbers."""
+    return actor, {}
+
+
 class Settings(NamedTuple):
     """Numbers that change from iteration to iteration (traced, so that nothing recompiles)."""
 
     learning_rate: Float[Array, ""]
     kl_limit: Float[Array, ""]
     """Epochs stop after one whose mean policy-KL exceeds this; infinite when `kl_rule` is another."""
+    adds: Bool[Array, ""]
+    """Whether something is added to PPO's gradient."""
     added_weights: Any = ()
     """Weights of what the method adds (Eq. 9)."""
 
@@ -188,8 +195,6 @@ def _actor_step(carry, batch, settings: Settings, old_log_std, ppo: PPOConfig, a
     (actor, optimizer), (own, extra) = carry, batch
     actor = jax.tree.map(lambda leaf: checkpoint_name(leaf, "theta"), actor)
     (loss, (means, ratio)), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(actor, own, ppo.clip_epsilon)
-    # The barrier keeps the compiler from fusing PPO's gradient with what is added to it: same bits with and without.
-    gradient, loss, means, ratio = jax.lax.optimization_barrier((gradient, loss, means, ratio))
     policy_kl = gaussian_kl(means, actor.log_std[None], own.old_means, old_log_std[None])
     metrics = {
         "ppo_loss": loss,
@@ -197,11 +202,15 @@ def _actor_step(carry, batch, settings: Settings, old_log_std, ppo: PPOConfig, a
         "ratio_error": jnp.max(jnp.abs(ratio - 1) * own.weights),
     }
     ppo_norm = tree_norm(gradient)
-    if added_gradient is not None:
-        extra_gradient, extra_metrics = added_gradient(actor, extra, settings.added_weights)
-        extra_gradient = jax.lax.optimization_barrier(extra_gradient)
-        gradient = jax.tree.map(jnp.add, gradient, extra_gradient)
-        metrics |= extra_metrics
+    # A branch of its own in every program, taken or not: the compiler cannot fuse PPO's part with what is added, so
+    # PPO's bits are the same with and without (a barrier is not enough: XLA's CPU compiler removes it before fusing).
+    add = added_gradient or nothing_to_add
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(add, actor, extra, settings.added_weights))
+    extra_gradient, extra_metrics = jax.lax.cond(
+        settings.adds, lambda: add(actor, extra, settings.added_weights), lambda: zeros
+    )
+    gradient = jax.tree.map(jnp.add, gradient, extra_gradient)
+    metrics |= extra_metrics
     metrics["actor_gradient_norm"] = tree_norm(gradient)
     metrics["pgshare"] = ppo_norm / (metrics["actor_gradient_norm"] + 1e-8)
     learned = _adam(actor, gradient, optimizer, settings.learning_rate, ppo.max_grad_norm)

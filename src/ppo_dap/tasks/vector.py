@@ -7,7 +7,7 @@ NEXT_STEP) ignored the action. Learners mask those rows everywhere.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,6 +29,7 @@ class Transition(NamedTuple):
     """What to act on next."""
 
 
+@runtime_checkable
 class VectorEnv(Protocol):
     """What rollouts and evaluation step."""
 

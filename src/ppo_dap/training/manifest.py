@@ -5,14 +5,22 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+from pathlib import Path
 from typing import Any
 
 PACKAGES = ("ppo-dap", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "envpool", "mujoco")
 
 
-def set_core_count() -> None:
-    """Set `NPROC` if the user has not: JAX's CPU results change with the cores it sees. Only before JAX is imported."""
+def prepare_jax() -> None:
+    """Set, before JAX is imported, what the user's environment does not: one core, and a cache of compiled programs.
+
+    JAX's results on a CPU change with the number of cores that it sees, so `NPROC` is 1 unless set.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ppo-dap" / "jax"
     os.environ.setdefault("NPROC", "1")
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 
 def manifest() -> dict[str, Any]:

@@ -81,5 +81,5 @@ def example_rollout(config: Config, observation_size: int, action_size: int) -> 
 def example_schedule(guided: bool) -> Schedule:
     """A schedule of zeros, for tracing."""
     zero = jnp.zeros(())
-    settings = Settings(zero, zero, Weights(zero, zero) if guided else ())
+    settings = Settings(zero, zero, jnp.asarray(guided), Weights(zero, zero) if guided else ())
     return Schedule(jnp.zeros((), jnp.int32), settings, zero, jnp.zeros((), jnp.int32))

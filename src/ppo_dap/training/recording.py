@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 TABLES = ("metrics", "evaluations")
 
@@ -60,6 +60,7 @@ def read_table(folder: Path, table: str) -> list[dict[str, Any]]:
     return rows
 
 
+@runtime_checkable
 class Progress(Protocol):
     """What shows a run's progress."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -139,9 +139,8 @@ def _make_trainer(
         frozen = Frozen(
             prior.denoiser, audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions))
         )
-    learner = create_learner(
-        jax.random.key(config.run.seed), sizes, config, None if frozen is None else frozen.denoiser
-    )
+    create = jax.jit(partial(create_learner, sizes=sizes, config=config))  # one program, not hundreds of small ones
+    learner = create(jax.random.key(config.run.seed), denoiser=None if frozen is None else frozen.denoiser)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
     lines = None
     checkpoint = folder / "checkpoints" / "last.safetensors"

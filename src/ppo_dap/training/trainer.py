@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import signal
@@ -71,24 +72,40 @@ class Trainer:
 
     def run(self) -> None:
         """Train until the budget is spent, or until Ctrl-C; the last checkpoint holds the end either way."""
+        self._write_audit()
+        try:
+            with self._deferred_interrupt():
+                if self.state.iteration == 0:
+                    self.evaluate()
+                while self.state.env_steps < self.config.run.steps and not self.interrupted:
+                    self._segment()
+                    self.checkpoint("last")
+            self.state.policy(self.spec, self.config.ppo.observation_clip).save(self.folder / "policy.safetensors")
+        finally:
+            self.recorder.close()
+            self.progress.close()
+
+    def _segment(self) -> None:
+        """Iterations up to the next checkpoint.
+
+        Environments start anew with each segment, so that a resumed run sees what an uninterrupted one does.
+        """
         config, state = self.config.run, self.state
-        with self._deferred_interrupt():
-            if state.iteration == 0:
-                self.evaluate()
-            collector = self._collector()
-            while state.env_steps < config.steps and not self.interrupted:
+        seed = _seed(config.seed, ENV_STREAM, state.iteration)
+        state.reward_scale = state.reward_scale.restart()
+        env = make_vector_env(self.spec.task, self.config.ppo.num_envs, seed, config.threads)
+        try:
+            collector = Collector(env)
+            while not self.interrupted:
                 before = state.env_steps
                 self.iterate(collector)
                 due = config.eval_every and state.env_steps // config.eval_every > before // config.eval_every
                 if due or state.env_steps >= config.steps:
                     self.evaluate()
-                if state.iteration % config.checkpoint_every == 0 and state.env_steps < config.steps:
-                    self.checkpoint("last")
-                    collector.env.close()
-                    collector = self._collector()
-            collector.env.close()
-        self.checkpoint("last")
-        self.finish()
+                if state.env_steps >= config.steps or state.iteration % config.checkpoint_every == 0:
+                    break
+        finally:
+            env.close()
 
     def iterate(self, collector: Collector) -> None:
         """One iteration of Algorithm 1 and its line in the metrics."""
@@ -138,10 +155,11 @@ class Trainer:
         decay = 1.0 if objective.lambda_decay is None else max(0.0, 1 - progress / objective.lambda_decay)
         updates = ppo.num_epochs * ppo.rollout_steps // ppo.minibatch_size
         pet = [steps_until(state.iteration + i, config.adaptation.pet_frequency, updates) for i in (0, 1)]
+        guided = self.frozen is not None
         weights = Weights(_f32(objective.lambda_kl * decay), _f32(objective.lambda_aux * decay))
         return Schedule(
             jnp.asarray(state.iteration * ppo.rollout_steps, jnp.int32),
-            Settings(_f32(rate), _f32(limit), weights if self.frozen is not None else ()),
+            Settings(_f32(rate), _f32(limit), jnp.asarray(guided), weights if guided else ()),
             _f32(beta_schedule(progress, config.proposals.beta_max, config.proposals.beta_anneal)),
             jnp.asarray(pet[1] - pet[0], jnp.int32),
         )
@@ -196,21 +214,10 @@ class Trainer:
             kept = f"the last good checkpoint is {last}" if last.is_file() else "there is no checkpoint yet"
             raise OSError(f"checkpoint {path} could not be written ({error.strerror}); {kept}") from error
 
-    def finish(self) -> None:
-        """Write the policy and the audit, and close the tables."""
-        self.state.policy(self.spec, self.config.ppo.observation_clip).save(self.folder / "policy.safetensors")
-        claims = [claim.__dict__ for claim in self.static_claims]
-        content = json.dumps({"static": claims, "iterations": self.state.iteration}, indent=1)
-        write_atomically(self.folder / "audit.json", content.encode())
-        self.recorder.close()
-        self.progress.close()
-
-    def _collector(self) -> Collector:
-        """Environments start anew at every checkpoint, so that a resumed run sees what an uninterrupted one does."""
-        config, state = self.config, self.state
-        seed = _seed(config.run.seed, ENV_STREAM, state.iteration)
-        state.reward_scale = state.reward_scale.restart()
-        return Collector(make_vector_env(self.spec.task, config.ppo.num_envs, seed, config.run.threads))
+    def _write_audit(self) -> None:
+        """What was proved about the update; what is measured is in the metrics."""
+        claims = [dataclasses.asdict(claim) for claim in self.static_claims]
+        write_atomically(self.folder / "audit.json", json.dumps({"static": claims}, indent=1).encode())
 
     @contextmanager
     def _deferred_interrupt(self) -> Iterator[None]:

@@ -1,0 +1,155 @@
+"""Eq. 9's last two terms against Monte Carlo and finite differences, and the gate in front of them by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.stats import norm
+
+from dap.dap_made import bits, changed, filled
+from ppo_dap.dap.objective import (
+    Batch,
+    GatedProposals,
+    Weights,
+    admit,
+    admit_proposals,
+    proposal_gradient,
+    proposal_terms,
+    provenance,
+)
+from ppo_dap.dap.proposals import Proposals
+from ppo_dap.nets.actor import Actor
+from ppo_dap.ppo.update import Rows
+
+N, K = 5, 4
+
+
+def numbers(*shape, seed=0):
+    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
+
+
+def gated_of(gate=(1, 1, 1, 1, 1), dtype=jnp.float32):
+    """Proposals without any pattern; the gate says which count."""
+    parts = numbers(N, 3, seed=1), numbers(N, K, 2, seed=2), numbers(N, 2, seed=3), np.exp(0.3 * numbers(N, 2, seed=4))
+    states, actions, mean, std = (jnp.asarray(p, dtype) for p in parts)
+    return GatedProposals(
+        Proposals(jnp.arange(N, dtype=jnp.int32), states, states, actions, mean, std), jnp.asarray(gate, dtype)
+    )
+
+
+def weights_of(kl, aux, dtype=jnp.float32):
+    return Weights(jnp.asarray(kl, dtype), jnp.asarray(aux, dtype))
+
+
+@pytest.fixture(scope="module")
+def actor():
+    return filled(lambda key: Actor.create(key, 3, 2, 4), 7)
+
+
+terms, gradient_of = jax.jit(proposal_terms), jax.jit(proposal_gradient)
+
+
+def test_value_by_monte_carlo_and_scipy(actor):
+    gated = gated_of(gate=(1, 0, 1, 1, 0))
+    proposals, used = gated.proposals, [0, 2, 3]
+    means, std = np.asarray(actor(proposals.observations)), np.exp(np.asarray(actor.log_std))
+    samples = means[:, None] + std * np.random.default_rng(0).standard_normal((N, 200_000, 2))
+    mean, spread = np.asarray(proposals.proxy_mean)[:, None], np.asarray(proposals.proxy_std)[:, None]
+    log_ratio = (norm.logpdf(samples, means[:, None], std) - norm.logpdf(samples, mean, spread)).sum(-1)
+    nll = -norm.logpdf(np.asarray(proposals.actions), means[:, None], std).sum(-1)
+    loss, metrics = terms(actor, gated, weights_of(2.0, 3.0))
+    assert float(metrics["kl_loss"]) == pytest.approx(log_ratio[used].mean(), rel=0.01)
+    assert float(metrics["aux_loss"]) == pytest.approx(nll[used].mean(), rel=1e-4)
+    assert float(loss) == pytest.approx(2 * log_ratio[used].mean() + 3 * nll[used].mean(), rel=0.01)
+
+
+def test_gradient_is_the_finite_difference_in_every_parameter(actor):
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), actor)
+        gated, weights = gated_of((1, 0, 1, 1, 1), jnp.float64), weights_of(0.7, 1.3, jnp.float64)
+        flat, restore = ravel_pytree(wide)
+        gradient = ravel_pytree(gradient_of(wide, gated, weights)[0])[0]
+        values = jax.jit(jax.vmap(lambda p: proposal_terms(restore(p), gated, weights)[0]))
+        steps = 1e-5 * jnp.eye(len(flat))
+        here = jnp.broadcast_to(flat, steps.shape)
+        slopes = (values(here + steps) - values(here - steps)) / 2e-5
+    np.testing.assert_allclose(gradient, slopes, atol=1e-8)
+    assert (np.asarray(gradient) != 0).all()
+
+
+def test_weights_are_linear_and_switch_their_term_off(actor):
+    def gradient(kl, aux):
+        return np.asarray(ravel_pytree(gradient_of(actor, gated_of(), weights_of(kl, aux))[0])[0])
+
+    kl, aux = gradient(1, 0), gradient(0, 1)
+    np.testing.assert_allclose(gradient(0.5, 3), 0.5 * kl + 3 * aux, rtol=1e-4, atol=1e-5)
+    assert np.linalg.norm(kl - aux) > 0.1
+    assert not gradient(0, 0).any()
+
+
+def test_what_the_gate_stops_counts_nowhere(actor):
+    weights = weights_of(1.0, 1.0)
+    half, none = gated_of((1, 1, 0, 0, 0)), gated_of((0, 0, 0, 0, 0))
+    assert float(terms(actor, none, weights)[0]) == 0
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient_of(actor, none, weights)[0]))
+    poisoned = changed(half.proposals, actions=half.proposals.actions.at[2:].set(50.0))
+    assert bits(terms(actor, GatedProposals(poisoned, half.gate), weights)) == bits(terms(actor, half, weights))
+    opened = GatedProposals(poisoned, gated_of().gate)
+    assert float(terms(actor, opened, weights)[0]) > 10 * float(terms(actor, half, weights)[0])
+
+
+def test_no_gradient_reaches_the_proposals(actor):
+    def loss(parts):
+        gated = gated_of()
+        gated = GatedProposals(changed(gated.proposals, actions=parts[0], proxy_mean=parts[1]), gated.gate)
+        return proposal_terms(actor, gated, weights_of(1.0, 1.0))[0]
+
+    proposals = gated_of().proposals
+    gradient = jax.grad(loss)((proposals.actions, proposals.proxy_mean))
+    assert not any(np.any(leaf) for leaf in gradient)
+
+
+# --- the gate -----------------------------------------------------------------------------------------------------
+
+
+STATES = numbers(4, 3, seed=8)
+BATCH = Batch(jnp.asarray(200, jnp.int32), jnp.asarray(STATES), jnp.asarray([1.0, 1.0, 0.0, 1.0]))
+STRANGE = STATES[3] + np.float32([0, 0, 1e-6])
+CASES = [
+    ("first row", 200, STATES[0], 1),
+    ("last row", 203, STATES[3], 1),
+    ("masked row", 202, STATES[2], 0),
+    ("id before the batch, of an earlier iteration", 199, STATES[3], 0),
+    ("id after the batch", 204, STATES[0], 0),
+    ("id of the logs", -1, STATES[3], 0),
+    ("id of an earlier iteration, the state of the row it had there", 100, STATES[0], 0),
+    ("id of another row of the batch", 201, STATES[0], 0),
+    ("its id, a state that is nearly its own", 203, STRANGE, 0),
+]
+
+
+def test_provenance_by_hand():
+    ids = jnp.asarray([case[1] for case in CASES], jnp.int32)
+    gate = provenance(ids, jnp.asarray(np.stack([case[2] for case in CASES])), BATCH)
+    assert {case[0]: int(g) for case, g in zip(CASES, gate, strict=True)} == {case[0]: case[3] for case in CASES}
+
+
+def test_admit_takes_the_weight_of_every_other_row_and_nothing_else():
+    n = len(CASES)
+    ids = jnp.asarray([case[1] for case in CASES], jnp.int32)
+    states = jnp.asarray(np.stack([case[2] for case in CASES]))
+    one, two = jnp.ones(n), jnp.ones((n, 2))
+    rows = Rows(ids, states, states, two, one, two, one, one, one, 0.5 * one)
+    admitted = admit(rows, BATCH)
+    np.testing.assert_array_equal(admitted.weights, [0.5 * case[3] for case in CASES])
+    assert bits(changed(admitted, weights=rows.weights)) == bits(rows)
+    proposals = Proposals(ids, states, states, jnp.ones((n, K, 2)), two, two)
+    np.testing.assert_array_equal(admit_proposals(proposals, BATCH).gate, [case[3] for case in CASES])
+
+
+def test_a_stale_batch_is_refused_as_a_whole():
+    ids = jnp.asarray([200, 201, 203], jnp.int32)
+    states = jnp.asarray(STATES[[0, 1, 3]])
+    assert np.asarray(provenance(ids, states, BATCH)).all()
+    assert not np.asarray(provenance(ids, states, BATCH._replace(first_id=jnp.asarray(204, jnp.int32)))).any()

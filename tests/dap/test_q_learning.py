@@ -1,0 +1,79 @@
+"""Q's fit on a problem whose Q is known, and that it leaves V alone unless it is told otherwise."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dap.dap_made import bits, changed, filled, quick_jit
+from ppo_dap.config import QConfig
+from ppo_dap.dap.q_learning import ADAM, QData, fit_q, trainable
+from ppo_dap.nets.critic import Critic, QFunction, q_features
+
+ROWS = 256
+
+
+@pytest.fixture(scope="module")
+def critic():
+    return filled(lambda key: Critic.create(key, 2, 8), 0)
+
+
+def target(states, actions):
+    """A bandit: the best action of state s is 0.5 s_0."""
+    return 1 - (actions[..., 0] - 0.5 * states[..., 0]) ** 2
+
+
+@pytest.fixture(scope="module")
+def rows():
+    rng = np.random.default_rng(1)
+    states, actions = rng.uniform(-1, 1, (ROWS, 2)), rng.uniform(-1, 1, (ROWS, 1))
+    parts = states, actions, target(states, actions), np.ones(ROWS)
+    return QData(*(jnp.asarray(p, jnp.float32) for p in parts))
+
+
+@pytest.fixture(scope="module")
+def fit(critic):
+    """(rows, trunk) -> fitted Q, critic, optimizer and loss; each trunk is compiled once."""
+    compiled = {}
+
+    def run(rows, trunk):
+        config = QConfig(q_trunk=trunk, q_epochs=150, q_learning_rate=1e-2, q_hidden_size=16)
+        q = filled(lambda key: QFunction.create(key, 2, 1, 8, 16, trunk == "separate"), 2)
+        compiled.setdefault(trunk, quick_jit(partial(fit_q, minibatch_size=64, config=config)))
+        return compiled[trunk](q, critic, ADAM.init(trainable(q, critic, config)), rows, jax.random.key(3))
+
+    return run
+
+
+@pytest.mark.parametrize("trunk", ["stop_gradient", "shared", "separate"])
+def test_q_finds_the_targets_and_the_best_actions(fit, rows, trunk):
+    q, critic, _, _ = fit(rows, trunk)
+    states = jnp.asarray(np.random.default_rng(9).uniform(-1, 1, (100, 2)), jnp.float32)  # not those it was fitted to
+    grid = np.linspace(-1, 1, 41, dtype=np.float32)
+    actions = jnp.asarray(np.broadcast_to(grid[:, None], (100, 41, 1)))
+    values = np.asarray(q(q_features(critic, q, states, shared=False), actions))
+    truth = target(np.asarray(states)[:, None], np.asarray(actions))
+    assert np.mean((values - truth) ** 2) < 0.05 * truth.var()
+    assert np.abs(grid[values.argmax(1)] - 0.5 * np.asarray(states)[:, 0]).mean() < 0.15
+
+
+def test_v_is_left_alone_unless_the_trunk_is_shared(fit, rows, critic):
+    for trunk in ("stop_gradient", "separate"):
+        assert bits(fit(rows, trunk)[1]) == bits(critic)
+    moved = fit(rows, "shared")[1]
+    assert bits(moved.v_head) == bits(critic.v_head)
+    assert all(a != b for a, b in zip(bits(moved.trunk), bits(critic.trunk), strict=True))
+
+
+def test_rows_without_weight_teach_nothing(fit, rows):
+    masked = np.arange(ROWS) % 4 == 0
+    weights = jnp.asarray(~masked, jnp.float32)
+    poisoned = changed(rows, targets=jnp.where(jnp.asarray(masked), 100.0, rows.targets))
+    clean, ignored, counted = (
+        fit(data, "stop_gradient")[0]
+        for data in (changed(rows, weights=weights), changed(poisoned, weights=weights), poisoned)
+    )
+    assert bits(clean) == bits(ignored)
+    assert bits(clean) != bits(counted)

@@ -1,0 +1,72 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ppo_dap.nets.critic import Critic, QFunction, q_features
+
+OBSERVATIONS = jnp.asarray(np.random.default_rng(0).standard_normal((6, 3)), jnp.float32)
+ACTIONS = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (6, 4, 2)), jnp.float32)
+CRITIC = Critic.create(jax.random.key(0), 3, 8)
+
+
+def create_q(own_trunk=False):
+    return QFunction.create(jax.random.key(1), 3, 2, 8, 5, own_trunk)
+
+
+def gradients(q, shared):
+    """Gradient of a loss of Q in the critic and in Q."""
+
+    def loss(critic, q):
+        return jnp.mean(jnp.square(q(q_features(critic, q, OBSERVATIONS, shared), ACTIONS) - 1))
+
+    return jax.jit(jax.grad(loss, argnums=(0, 1)))(CRITIC, q)
+
+
+def moves(tree):
+    return any(np.any(leaf) for leaf in jax.tree.leaves(tree))
+
+
+@pytest.mark.parametrize(
+    ("own_trunk", "shared", "reaches"), [(False, False, False), (False, True, True), (True, True, False)]
+)
+def test_qs_gradient_reaches_vs_trunk_only_when_shared(own_trunk, shared, reaches):
+    in_critic, in_q = gradients(create_q(own_trunk), shared)
+    assert moves(in_critic.trunk) == reaches
+    assert not moves(in_critic.v_head)
+    assert all(moves(layer) for layer in (in_q.state, in_q.action, in_q.out))
+    assert moves(in_q.trunk) == own_trunk
+
+
+def test_a_trunk_of_its_own_does_not_read_the_critics():
+    other = Critic.create(jax.random.key(7), 3, 8)
+    for own_trunk in (True, False):
+        q = create_q(own_trunk)
+        features = [np.asarray(q_features(critic, q, OBSERVATIONS, True)) for critic in (CRITIC, other)]
+        assert np.array_equal(*features) == own_trunk
+
+
+def test_stopping_the_gradient_changes_no_value():
+    q = create_q()
+    stopped, shared = (q_features(CRITIC, q, OBSERVATIONS, s) for s in (False, True))
+    np.testing.assert_array_equal(stopped, shared)
+
+
+def numpy_linear(layer, x):
+    return x @ np.asarray(layer.weight).T + np.asarray(layer.bias)
+
+
+def test_values_and_q_equal_plain_numpy_row_by_row():
+    q = jax.tree.map(lambda leaf: leaf + 0.1, create_q())
+    critic = jax.tree.map(lambda leaf: leaf + 0.1, CRITIC)
+    values, q_values = critic(OBSERVATIONS), q(critic.features(OBSERVATIONS), ACTIONS)
+    assert values.shape == (6,)
+    assert q_values.shape == (6, 4)
+    for i in range(6):
+        hidden = np.asarray(OBSERVATIONS)[i]
+        for layer in critic.trunk.layers:
+            hidden = np.tanh(numpy_linear(layer, hidden))
+        assert float(values[i]) == pytest.approx(numpy_linear(critic.v_head, hidden)[0], abs=1e-5)
+        for k in range(4):
+            both = np.tanh(numpy_linear(q.state, hidden) + numpy_linear(q.action, np.asarray(ACTIONS)[i, k]))
+            assert float(q_values[i, k]) == pytest.approx(numpy_linear(q.out, both)[0], abs=1e-5)
