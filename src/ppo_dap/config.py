@@ -180,7 +180,7 @@ class Config:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
-    "tuned": {"lambda_kl": 0.05, "lambda_aux": 0.1},
+    "tuned": {"lambda_kl": 0.05, "lambda_aux": 0.1, "kl_rule": "monitor"},
 }
 
 

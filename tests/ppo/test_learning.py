@@ -52,7 +52,13 @@ def iteration(state, rollout, key, ppo=PPO):
     rows = estimate_advantages(state.critic, rollout, no_normaliser(1), ppo)
     rate = jnp.float32(1e-2)
     actor, actor_optimizer, metrics = improve_actor(
-        state.actor, state.actor_optimizer, rows, (), key, Settings(rate, jnp.float32(np.inf)), ppo=ppo
+        state.actor,
+        state.actor_optimizer,
+        rows,
+        (),
+        key,
+        Settings(rate, jnp.float32(np.inf), jnp.array(False)),
+        ppo=ppo,
     )
     critic, critic_optimizer, _ = improve_critic(state.critic, state.critic_optimizer, rows, key, rate, ppo=ppo)
     return PPOState(actor, critic, actor_optimizer, critic_optimizer), metrics["ratio_error"]

@@ -22,7 +22,7 @@ PPO = small_config()
 MINIBATCHES = PPO.rollout_steps // PPO.minibatch_size
 STATE = PPOState.create(jax.random.key(0), 3, 2, PPO.hidden_size)
 KEY = jax.random.key(1)
-LIMITLESS = Settings(jnp.float32(3e-3), jnp.float32(np.inf), jnp.float32(0))
+LIMITLESS = Settings(jnp.float32(3e-3), jnp.float32(np.inf), jnp.array(False))
 RATE = jnp.float32(1e-3)
 ROWS = make_rows(STATE.actor)
 CRITIC = jax.jit(functools.partial(improve_critic, ppo=PPO))
@@ -131,19 +131,23 @@ def pull(actor, added, weight):
     return jax.grad(loss)(actor), {"seen": jnp.mean(added)}
 
 
-ADDED = jnp.full((8, 3), 5.0)
+def pulled(weight, adds=True):
+    settings = LIMITLESS._replace(adds=jnp.array(adds), added_weights=jnp.float32(weight))
+    return improve(settings=settings, added=jnp.full((8, 3), 5.0), added_gradient=pull)
 
 
 def test_an_added_gradient_of_zeros_leaves_every_bit():
-    """Two programs, one with another term in it: the compiler must not fuse them differently."""
-    with_zeros = improve(added=ADDED, added_gradient=pull)
-    assert_same_bits(with_zeros[:2], improve()[:2])
-    assert float(with_zeros[2]["pgshare"]) == pytest.approx(1, abs=1e-4)
+    """Two programs, one with another term in it: the compiler must not fuse PPO's part differently."""
+    plain = improve()
+    for with_zeros in (pulled(0), pulled(5, adds=False)):
+        assert_same_bits(with_zeros[:2], plain[:2])
+        for name, value in plain[2].items():
+            np.testing.assert_array_equal(with_zeros[2][name], value)
+    assert float(plain[2]["pgshare"]) == pytest.approx(1, abs=1e-4)
 
 
 def test_an_added_gradient_acts_and_is_reported():
-    settings = LIMITLESS._replace(added_weights=jnp.float32(5))
-    learned, _, metrics = improve(settings=settings, added=ADDED, added_gradient=pull)
+    learned, _, metrics = pulled(5)
     assert np.all(np.asarray(learned.log_std) < np.asarray(improve()[0].log_std) - 0.01)
     assert float(metrics["seen"]) == 5
     assert 0 < float(metrics["pgshare"]) < 0.3

@@ -164,7 +164,7 @@ def test_a_checkpoint_of_a_newer_version_is_refused(tmp_path, uninterrupted, hop
     content = path.read_bytes()
     path.write_bytes(content.replace(b'\\"format\\": 1', b'\\"format\\": 9', 1))
     assert path.read_bytes() != content
-    with pytest.raises(ppo_dap.InputError, match="checkpoint format 9.*reads up to 1"):
+    with pytest.raises(ppo_dap.InputError, match=r"checkpoint format 9.*reads up to 1"):
         ppo_dap.train("Hopper-v5", prior=hopper_prior, out=out, steps=1500, resume=True, **small)
 
 

@@ -31,6 +31,26 @@ class GuideState(eqx.Module):
     pet_optimizer: optax.OptState
 
 
+class OnPolicy(eqx.Module):
+    """What the guide needs of D_on, a row each."""
+
+    state_ids: Int[Array, " rows"]
+    raw_observations: Float[Array, "rows obs"]
+    """What the prior reads."""
+    observations: Float[Array, "rows obs"]
+    """What the policy and Q read (normalised)."""
+    actions: Float[Array, "rows act"]
+    """As executed: scaled and clipped to [-1, 1]."""
+    q_targets: Float[Array, " rows"]
+    weights: Float[Array, " rows"]
+
+
+def on_policy(rows: Rows) -> OnPolicy:
+    """PPO's rows as the guide sees them."""
+    executed = jnp.clip(rows.actions, -1.0, 1.0)
+    return OnPolicy(rows.state_ids, rows.raw_observations, rows.observations, executed, rows.q_targets, rows.weights)
+
+
 def create_guide(
     key: PRNGKeyArray, critic: Critic | None, sizes: tuple[int, int], config: Config, denoiser: Denoiser
 ) -> GuideState:
@@ -58,7 +78,7 @@ def make_proposals(
     guide: GuideState,
     denoiser: Denoiser,
     critic: Critic | None,
-    rows: Rows,
+    rows: OnPolicy,
     batch: Batch,
     beta: Float[Array, ""],
     key: PRNGKeyArray,
@@ -89,15 +109,17 @@ def make_proposals(
     )
     gated = admit_proposals(proposals, batch)
     spread = Q_SPREAD_DECAY * guide.q_spread + (1 - Q_SPREAD_DECAY) * metrics.pop("q_spread")
-    return gated, spread, metrics | {"spr": jnp.mean(gated.gate)}
+    # Rows in which no transition happened fill up the subset when it wants more states than there are; the gate stops
+    # them, and they are no proposals of another batch.
+    expected = jnp.sum(batch.weights[index] > 0)
+    return gated, spread, metrics | {"spr": jnp.sum(gated.gate) / jnp.maximum(expected, 1)}
 
 
 def learn_q(
-    guide: GuideState, critic: Critic | None, rows: Rows, key: PRNGKeyArray, *, config: Config
+    guide: GuideState, critic: Critic | None, rows: OnPolicy, key: PRNGKeyArray, *, config: Config
 ) -> tuple[QFunction, Critic | None, optax.OptState, dict[str, Float[Array, ""]]]:
     """Step 4, Q's part: one-step TD on the actions that were executed (clipped to the box)."""
-    executed = jnp.clip(rows.actions, -1.0, 1.0)
-    data = q_learning.QData(rows.observations, executed, rows.q_targets, rows.weights)
+    data = q_learning.QData(rows.observations, rows.actions, rows.q_targets, rows.weights)
     size = min(config.ppo.minibatch_size, rows.weights.shape[0])
     q, critic, optimizer, loss = q_learning.fit_q(
         guide.q, critic, guide.q_optimizer, data, key, minibatch_size=size, config=config.q
@@ -108,7 +130,7 @@ def learn_q(
 def adapt_prior(
     guide: GuideState,
     denoiser: Denoiser,
-    rows: Rows,
+    rows: OnPolicy,
     batch: Batch,
     num_steps: Int[Array, ""],
     key: PRNGKeyArray,
@@ -117,8 +139,7 @@ def adapt_prior(
     diffusion: DiffusionConfig,
 ) -> tuple[Adapters, optax.OptState, dict[str, Float[Array, ""]]]:
     """Step 5: PET on the actions that were executed."""
-    executed = jnp.clip(rows.actions, -1.0, 1.0)
-    data = adaptation.PETData(rows.state_ids, rows.raw_observations, executed, rows.weights)
+    data = adaptation.PETData(rows.state_ids, rows.raw_observations, rows.actions, rows.weights)
     adapters, optimizer, metrics = adaptation.adapt(
         denoiser,
         guide.adapters,

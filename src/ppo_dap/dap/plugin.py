@@ -13,13 +13,12 @@ from jaxtyping import ArrayLike
 from ppo_dap import config as configs
 from ppo_dap.dap.adaptation import steps_until
 from ppo_dap.dap.guidance import beta_schedule
-from ppo_dap.dap.guide import GuideState, adapt_prior, create_guide, learn_q, make_proposals
+from ppo_dap.dap.guide import GuideState, OnPolicy, adapt_prior, create_guide, learn_q, make_proposals
 from ppo_dap.dap.objective import Batch
 from ppo_dap.dap.proposals import Proposals
 from ppo_dap.errors import InputError
 from ppo_dap.nets.normalizer import RunningMoments
 from ppo_dap.nets.policy import scale_actions
-from ppo_dap.ppo.update import Rows
 from ppo_dap.priors import DiffusionPrior
 
 
@@ -92,7 +91,7 @@ class Guide:
         self.metrics = {name: float(v) for name, v in (proposed | learned | adapted).items()}
         return self._in_environment_units(gated.proposals)
 
-    def _rows(self, observations, actions, rewards, next_values, terminated, valid) -> tuple[Rows, Batch]:
+    def _rows(self, observations, actions, rewards, next_values, terminated, valid) -> tuple[OnPolicy, Batch]:
         prior, ppo = self.prior, self.config.ppo
         observations = _checked("observations", observations, (None, prior.observation_size))
         n = len(observations)
@@ -110,18 +109,13 @@ class Guide:
         normalised = np.clip((observations - self._moments.mean) / self._moments.std, -10.0, 10.0)
         scaled = scale_actions(actions, prior.action_low, prior.action_high)
         ids = jnp.arange(n, dtype=jnp.int32)
-        zeros = jnp.zeros(n)
-        rows = Rows(
-            state_ids=ids,
-            raw_observations=jnp.asarray(observations),
-            observations=jnp.asarray(normalised, jnp.float32),
-            actions=jnp.asarray(scaled, jnp.float32),
-            old_log_probs=zeros,
-            old_means=jnp.asarray(scaled, jnp.float32),
-            advantages=zeros,
-            returns=zeros,
-            q_targets=jnp.asarray(targets / float(self._rewards.std[0]), jnp.float32),
-            weights=jnp.asarray(weights),
+        rows = OnPolicy(
+            ids,
+            jnp.asarray(observations),
+            jnp.asarray(normalised, jnp.float32),
+            jnp.asarray(np.clip(scaled, -1.0, 1.0), jnp.float32),
+            jnp.asarray(targets / float(self._rewards.std[0]), jnp.float32),
+            jnp.asarray(weights),
         )
         return rows, Batch(ids[0], rows.raw_observations, rows.weights)
 

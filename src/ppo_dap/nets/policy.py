@@ -75,6 +75,10 @@ def load_policy(path: str | os.PathLike) -> Policy:
     """Read a file that `Policy.save` wrote; raises `InputError` for anything else."""
     tensors, meta = read_tensors(Path(path), kind="policy", newest=FORMAT)
     depth = sum(name.startswith("weight") for name in tensors)
+    wanted = [f"{part}{i}" for i in range(max(depth, 1)) for part in ("weight", "bias")]
+    wanted += ["log_std", "observation_mean", "observation_std", "action_low", "action_high"]
+    if missing := [name for name in wanted if name not in tensors]:
+        raise InputError(f"{path} is not a whole policy file: {', '.join(missing)} missing")
     return Policy(
         tuple(tensors[f"weight{i}"] for i in range(depth)),
         tuple(tensors[f"bias{i}"] for i in range(depth)),

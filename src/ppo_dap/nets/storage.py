@@ -49,9 +49,10 @@ def read_tensors(path: Path, kind: str, newest: int) -> tuple[dict[str, np.ndarr
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, ValueError, OSError) as error:
         raise InputError(f"{path} is not a whole {kind} file: {error}") from error
-    if meta.get("kind") != kind:
-        raise InputError(f"{path} is not a {kind} file but a {meta.get('kind', 'foreign safetensors')} file")
-    if meta.get("format", 0) > newest:
+    if not isinstance(meta, dict) or meta.get("kind") != kind or not isinstance(meta.get("format"), int):
+        found = meta.get("kind", "foreign safetensors") if isinstance(meta, dict) else "foreign safetensors"
+        raise InputError(f"{path} is not a {kind} file but a {found} file")
+    if meta["format"] > newest:
         raise InputError(
             f"{path} has {kind} format {meta['format']}, this version of ppo-dap reads up to {newest}: update ppo-dap"
         )

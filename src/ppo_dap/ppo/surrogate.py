@@ -19,6 +19,7 @@ def clipped_surrogate(
     ratio: Float[Array, " n"], advantages: Float[Array, " n"], weights: Float[Array, " n"], clip_epsilon: float
 ) -> Float[Array, ""]:
     """Eq. 5: E[min(r A, clip(r, 1 - eps, 1 + eps) A)], to be maximised; a mean over rows by `weights` (0 masks)."""
+    advantages = checkpoint_name(advantages, "advantages")
     clipped = jnp.clip(ratio, 1 - clip_epsilon, 1 + clip_epsilon)
     return weighted_mean(jnp.minimum(ratio * advantages, clipped * advantages), weights)
 

@@ -113,7 +113,9 @@ def estimate_advantages(critic: Critic, rollout: Rollout, normaliser: Normaliser
 def ppo_loss(actor: Actor, rows: Rows, clip_epsilon: float) -> tuple[Float[Array, ""], tuple]:
     """Minus Eq. 5 on a minibatch; also the exact KL(pi_theta || pi_old) and the ratio."""
     means = actor(rows.observations)
-    ratio = importance_ratio(log_prob(rows.actions, means, actor.log_std), rows.old_log_probs)
+    log_probs = log_prob(rows.actions, means, actor.log_std)
+    # A masked row's ratio is 1: a weight of 0 would not stop an overflow in it.
+    ratio = importance_ratio(jnp.where(rows.weights > 0, log_probs, rows.old_log_probs), rows.old_log_probs)
     advantages = normalise(rows.advantages, rows.weights)
     return -clipped_surrogate(ratio, advantages, rows.weights, clip_epsilon), (means, ratio)
 

@@ -72,7 +72,7 @@ def make_gymnasium(task: str) -> Any:
         known = set(gymnasium.registry) | ENVPOOL_TASKS
         near = difflib.get_close_matches(task, known, n=1)
         raise unknown("task", task, known if near else {t for t in ENVPOOL_TASKS if t.endswith("v5")}) from None
-    except gymnasium.error.Error as error:
+    except (gymnasium.error.Error, ImportError) as error:
         raise InputError(f"task {task!r} cannot be made: {' '.join(str(error).split())}") from error
 
 

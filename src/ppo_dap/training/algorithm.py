@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ppo_dap.config import Config
 from ppo_dap.dap import audit
-from ppo_dap.dap.guide import GuideState, adapt_prior, create_guide, learn_q, make_proposals
+from ppo_dap.dap.guide import GuideState, adapt_prior, create_guide, learn_q, make_proposals, on_policy
 from ppo_dap.dap.objective import Batch, admit, proposal_gradient
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.rollout import Rollout
@@ -107,7 +107,15 @@ def update(
     gated: Any = ()
     if guide is not None and frozen is not None:
         gated, q_spread, proposed = run(
-            "proposals", stages.propose, guide, frozen.denoiser, old.critic, rows, batch, schedule.beta, keys[1]
+            "proposals",
+            stages.propose,
+            guide,
+            frozen.denoiser,
+            old.critic,
+            on_policy(rows),
+            batch,
+            schedule.beta,
+            keys[1],
         )
         metrics |= proposed
 
@@ -121,11 +129,11 @@ def update(
     metrics |= improved | valued | run("audit", stages.policy_metrics, actor, old.actor.log_std, rows)
     if guide is None or frozen is None:
         return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None), metrics
-    q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, rows, keys[3])
+    q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, on_policy(rows), keys[3])
 
     # 5) PET: the adapters alone, on D_on.
     adapters, pet_optimizer, adapted = run(
-        "pet", stages.adapt, guide, frozen.denoiser, rows, batch, schedule.pet_steps, keys[4]
+        "pet", stages.adapt, guide, frozen.denoiser, on_policy(rows), batch, schedule.pet_steps, keys[4]
     )
 
     # 6) Monitoring.

@@ -70,7 +70,7 @@ class Run:
         if not path.is_file():
             raise InputError(f"{self.folder} has no audit.json: is it a run folder?")
         static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
-        return static + audit.measured_claims(self.metrics)
+        return static + audit.measured_claims(self.metrics, guided=self.config["prior_hash"] is not None)
 
 
 def load_run(folder: str | Path) -> Run:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -40,8 +39,9 @@ def warm_start(state: TrainState, logs: Logs, spec: TaskSpec, config: Config) ->
     train, held_out = (_data(part, moments, spec, config) for part in logs.split(seed=config.run.seed))
     learner = state.learner
     actor = _fit(learner.ppo.actor, _actor_loss, train, held_out, config)
-    floor = math.log(start.warm_start_std_floor)
-    actor = eqx.tree_at(lambda a: a.log_std, actor, jnp.maximum(actor.log_std, floor))
+    # The spread's maximum likelihood given the means is known exactly; Adam would take thousands of steps to get there.
+    spread = jnp.sqrt(jnp.mean(jnp.square(train["actions"] - actor(train["observations"])), axis=0))
+    actor = eqx.tree_at(lambda a: a.log_std, actor, jnp.log(jnp.maximum(spread, start.warm_start_std_floor)))
     learner = eqx.tree_at(lambda s: s.ppo.actor, learner, actor)
     reward_scale = state.reward_scale
     if start.warm_start == "actor_critic":
