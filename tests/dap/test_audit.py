@@ -21,9 +21,9 @@ from dap.dap_made import (
     small_config,
     with_fault,
 )
-from ppo_dap.dap import audit
+from ppo_dap.dap import audit, guide, objective
 from ppo_dap.dap.dataflow import Flow
-from ppo_dap.dap.guide import guide, objective, on_policy
+from ppo_dap.dap.guide import on_policy
 from ppo_dap.dap.objective import proposal_terms
 from ppo_dap.training import proof
 from ppo_dap.training.algorithm import Stages, update
