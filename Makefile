@@ -20,6 +20,10 @@ lint: .venv/.ready  ## style, formatting and types
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+sample: .venv/.ready  ## make the shipped Hopper logs again and print their hash: 600k steps of PPO, then 40k rows of it
+	$(BIN)/ppo-dap train --task Hopper-v5 --method ppo --steps 600000 --seed 100 --out runs/hopper-behaviour --quiet
+	$(BIN)/ppo-dap collect runs/hopper-behaviour --steps 40000 --out src/ppo_dap/logs/samples/hopper-medium.npz
+
 lock:  ## resolve pyproject.toml into constraints.txt; UPGRADE=--upgrade moves to the newest versions
 	$(PYTHON) -m venv --clear .venv/lock
 	.venv/lock/bin/python -m pip install --disable-pip-version-check --quiet uv
@@ -38,4 +42,4 @@ lock:  ## resolve pyproject.toml into constraints.txt; UPGRADE=--upgrade moves t
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 
-.PHONY: help quickstart test lint lock
+.PHONY: help quickstart test lint sample lock

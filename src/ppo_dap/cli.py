@@ -72,6 +72,16 @@ def build_parser() -> Parser:
         sub.set_defaults(run=run)
         return sub
 
+    _from_logs_to_runs(command)
+    _about_runs(command)
+    return parser
+
+
+Command = Callable[[str, Callable[[argparse.Namespace], int], str], Parser]
+"""Adds a command: (name, what runs it, what it does)."""
+
+
+def _from_logs_to_runs(command: Command) -> None:
     sub = command("quickstart", commands.quickstart, "the main job on the shipped sample, in a few minutes")
     sub.add_argument(
         "--out", default="quickstart", metavar="FOLDER", help="where everything goes (default: %(default)s)"
@@ -101,6 +111,8 @@ def build_parser() -> Parser:
     sub.add_argument("--json", action="store_true", help="print the last evaluation as JSON")
     _config_options(sub)
 
+
+def _about_runs(command: Command) -> None:
     sub = command("evaluate", commands.evaluate, "returns of a run's deterministic policy")
     sub.add_argument("folder", metavar="RUN", help="run folder")
     sub.add_argument("--task", metavar="ID", help="another task of the same dimensions")
@@ -128,7 +140,6 @@ def build_parser() -> Parser:
 
     sub = command("methods", commands.methods, "the methods and what each of them uses (Table 3)")
     sub.add_argument("--json", action="store_true", help="print JSON")
-    return parser
 
 
 def _logs_option(parser: Parser, required: bool) -> None:

@@ -128,7 +128,6 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["a.npz"]
 
 
-@pytest.mark.parametrize(("path", "match"), [("absent/a.npz", "cannot be written"), ("a.npy", "must end in .npz")])
 def test_save_npz_refuses_bad_paths(tmp_path, path, match):
     with pytest.raises(InputError, match=match):
         save_npz(make_logs(), tmp_path / path)

@@ -1,5 +1,6 @@
 """The `.npz` layout: reading without pickle, and writing the same bytes for the same logs."""
 
+import io
 import math
 import os
 import zipfile
@@ -10,6 +11,7 @@ import numpy as np
 from ppo_dap.errors import InputError, unknown
 from ppo_dap.logs.dataset import Logs
 from ppo_dap.logs.reading import assemble, reading, refuse_large
+from ppo_dap.storage import write_atomically
 
 ALIASES = {"terminals": "terminated", "timeouts": "truncated"}
 KEYS = (
@@ -99,16 +101,10 @@ def save_npz(logs: Logs, path: str | os.PathLike) -> None:
             arrays[name] = getattr(logs, name)
     if logs.task is not None:
         arrays["task"] = np.array(logs.task)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    content = io.BytesIO()
+    _write_members(content, arrays)
     try:
-        try:
-            with open(temporary, "wb") as stream:
-                _write_members(stream, arrays)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_atomically(path, content.getvalue())
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}): must be in a writable folder") from None
 

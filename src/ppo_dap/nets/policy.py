@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ppo_dap.errors import InputError
-from ppo_dap.nets.storage import read_tensors, write_tensors
+from ppo_dap.storage import read_tensors, write_tensors
 
 FORMAT = 1
 

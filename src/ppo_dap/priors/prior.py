@@ -18,9 +18,11 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ppo_dap.errors import InputError, unknown
-from ppo_dap.priors import store
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 from ppo_dap.priors.samplers import sample_actions
+from ppo_dap.storage import read_tensors, tree_from_tensors, tree_to_tensors, write_tensors
+
+FORMAT = 1
 
 
 @runtime_checkable
@@ -127,11 +129,13 @@ class DiffusionPrior:
 
     def save(self, path: str | Path) -> None:
         """Write the prior to exactly `path`."""
-        tensors = store.to_tensors(self.denoiser, "denoiser")
+        tensors = tree_to_tensors(self.denoiser, "denoiser")
         for name in _ARRAYS:
             tensors[name] = getattr(self, name)
         header = {
-            "kind": self.kind,
+            "kind": "prior",
+            "format": FORMAT,
+            "prior": self.kind,
             "config": dataclasses.asdict(self.config),
             "task": self.task,
             "logs_hash": self.logs_hash,
@@ -139,7 +143,10 @@ class DiffusionPrior:
             "observation_size": self.observation_size,
             "action_size": self.action_size,
         }
-        store.write(path, tensors, header)
+        try:
+            write_tensors(Path(path), tensors, header)
+        except OSError as error:
+            raise InputError(f"cannot write prior {path}: {error.strerror}") from error
 
     @staticmethod
     def from_file(tensors: dict[str, np.ndarray], header: dict[str, Any], source: object) -> DiffusionPrior:
@@ -151,7 +158,7 @@ class DiffusionPrior:
         if missing:
             raise InputError(f"{source} is damaged: {missing[0]} is missing")
         return DiffusionPrior(
-            denoiser=store.from_tensors(blank, tensors, "denoiser", source),
+            denoiser=tree_from_tensors(blank, tensors, "denoiser", source),
             config=config,
             task=header["task"],
             logs_hash=header["logs_hash"],
@@ -173,10 +180,10 @@ _KINDS = {"diffusion": DiffusionPrior}
 
 def load_prior(path: str | Path) -> Prior:
     """The prior that was saved to `path`."""
-    tensors, header = store.read(path)
-    if header.get("kind") not in _KINDS:
-        raise InputError(f"{path}: {unknown('prior kind', header.get('kind'), _KINDS)}")
+    tensors, header = read_tensors(Path(path), kind="prior", newest=FORMAT)
+    if header.get("prior") not in _KINDS:
+        raise InputError(f"{path}: {unknown('prior kind', header.get('prior'), _KINDS)}")
     try:
-        return _KINDS[header["kind"]].from_file(tensors, header, path)
+        return _KINDS[header["prior"]].from_file(tensors, header, path)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} is damaged: its header lacks or misnames {error}") from error

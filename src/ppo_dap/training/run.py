@@ -20,8 +20,8 @@ from ppo_dap.logs import Logs, load_logs, require_compatible
 from ppo_dap.methods import Method, get_method, resolve
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy, load_policy
-from ppo_dap.nets.storage import write_atomically
 from ppo_dap.priors import DiffusionPrior, load_prior
+from ppo_dap.storage import write_atomically
 from ppo_dap.tasks import TaskSpec, describe
 from ppo_dap.training.algorithm import Frozen, Stages, create_learner
 from ppo_dap.training.manifest import manifest

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ppo_dap.errors import InputError
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy
-from ppo_dap.nets.storage import read_tensors, write_tensors
+from ppo_dap.storage import read_tensors, tree_from_tensors, tree_to_tensors, write_tensors
 from ppo_dap.tasks import TaskSpec
 from ppo_dap.training.algorithm import Learner
 
@@ -62,13 +59,7 @@ def load_checkpoint(path: Path, like: TrainState) -> tuple[TrainState, dict[str,
     Raises `InputError` for a file that is no checkpoint, is damaged, newer, or of other networks.
     """
     tensors, meta = read_tensors(path, kind="checkpoint", newest=FORMAT)
-    expected = _tensors(like)
-    for name, tensor in expected.items():
-        if name not in tensors or tensors[name].shape != tensor.shape:
-            found = tensors[name].shape if name in tensors else "nothing"
-            raise InputError(f"{path} has {found} for {name}, this run needs {tensor.shape}: was it another config?")
-    leaves = [jnp.asarray(tensors[name]) for name in _learner_names(like.learner)]
-    learner = jax.tree.unflatten(jax.tree.structure(like.learner), leaves)
+    learner = tree_from_tensors(like.learner, tensors, "learner", path)
     moments = {
         key: RunningMoments(float(tensors[f"{key}.count"]), tensors[f"{key}.mean"], tensors[f"{key}.m2"])
         for key in ("observations", "rewards")
@@ -82,13 +73,8 @@ def load_checkpoint(path: Path, like: TrainState) -> tuple[TrainState, dict[str,
 _NUMBERS = ("iteration", "env_steps", "learning_rate_scale", "best_return")
 
 
-def _learner_names(learner: Learner) -> list[str]:
-    return ["learner" + jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(learner)]
-
-
 def _tensors(state: TrainState) -> dict[str, np.ndarray]:
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state.learner)]
-    tensors = dict(zip(_learner_names(state.learner), leaves, strict=True))
+    tensors = tree_to_tensors(state.learner, "learner")
     for key, moments in (("observations", state.observations), ("rewards", state.reward_scale.moments)):
         tensors |= {f"{key}.count": np.array(moments.count), f"{key}.mean": moments.mean, f"{key}.m2": moments.m2}
     return tensors

@@ -23,9 +23,9 @@ from ppo_dap.dap.adaptation import steps_until
 from ppo_dap.dap.guidance import beta_schedule
 from ppo_dap.dap.objective import Weights
 from ppo_dap.errors import TrainingDiverged
-from ppo_dap.nets.storage import write_atomically
 from ppo_dap.ppo.rollout import Collector, Rollout
 from ppo_dap.ppo.update import Normaliser, Settings
+from ppo_dap.storage import write_atomically
 from ppo_dap.tasks import TaskSpec, make_vector_env
 from ppo_dap.training.algorithm import Frozen, Schedule, Stages, update
 from ppo_dap.training.evaluation import evaluate_policy

@@ -37,6 +37,27 @@ def write_atomically(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
+def tree_to_tensors(tree: Any, prefix: str) -> dict[str, np.ndarray]:
+    """The arrays of a pytree, by their path in it."""
+    import jax
+
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {prefix + jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
+
+
+def tree_from_tensors(like: Any, tensors: Mapping[str, np.ndarray], prefix: str, source: object) -> Any:
+    """`like` with the arrays that `tree_to_tensors` wrote; raises `InputError` where names or shapes differ."""
+    import jax
+
+    loaded = []
+    for name, leaf in tree_to_tensors(like, prefix).items():
+        if name not in tensors or tensors[name].shape != leaf.shape:
+            found = tensors[name].shape if name in tensors else "nothing"
+            raise InputError(f"{source} has {found} for {name} where {leaf.shape} is needed: was it another config?")
+        loaded.append(jax.numpy.asarray(tensors[name]))
+    return jax.tree.unflatten(jax.tree.structure(like), loaded)
+
+
 def read_tensors(path: Path, kind: str, newest: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and meta of a file of this `kind`, whose format is at most `newest`; raises `InputError` otherwise."""
     from safetensors import SafetensorError, safe_open

@@ -7,7 +7,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from ppo_dap.errors import InputError
-from ppo_dap.nets.storage import read_tensors, write_atomically, write_tensors
+from ppo_dap.storage import read_tensors, write_atomically, write_tensors
 
 TENSORS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array(2.5), "c": np.arange(4).reshape(2, 2).T}
 META = {"kind": "thing", "format": 2, "text": "ü", "nested": {"none": None, "list": [1, 2.5]}}
@@ -56,7 +56,7 @@ def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, write, survives):
     code = f"""
 import resource
 from pathlib import Path
-from ppo_dap.nets.storage import write_atomically
+from ppo_dap.storage import write_atomically
 path, content = Path({str(file)!r}), bytes(100_000)
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 try:
