@@ -108,7 +108,7 @@ def write_runs(folder):
             "method": "ppo",
             "preset": "paper",
             "prior_hash": None,
-            "config": flatten(Config()),
+            "config": flatten(Config()) | {"steps": 7},
         }
         (folder / name / "config.json").write_text(json.dumps(description))
         (folder / name / "evaluations.jsonl").write_text(json.dumps({"env_steps": 5, "return_mean": 1.0}) + "\n")

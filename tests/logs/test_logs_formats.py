@@ -128,7 +128,9 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["a.npz"]
 
 
+@pytest.mark.parametrize(("path", "match"), [("file/a.npz", "cannot be written"), ("a.npy", "must end in .npz")])
 def test_save_npz_refuses_bad_paths(tmp_path, path, match):
+    (tmp_path / "file").touch()
     with pytest.raises(InputError, match=match):
         save_npz(make_logs(), tmp_path / path)
 
