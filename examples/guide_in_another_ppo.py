@@ -1,7 +1,6 @@
 """PPO-DAP in a PPO that is not ours: a tiny one in JAX on Pendulum-v1, with the logs of an old controller.
 
-All it takes is marked DAP: fit a prior to the logs, ask `ppo_dap.Guide` for proposals once an iteration, add two terms
-to the policy's loss on the proposals' states (Eq. 9). Ratios and advantages stay as they are.
+All it takes: fit a prior to the logs, ask the Guide for proposals once an iteration, add two terms to the loss (Eq. 9).
 """
 
 import gymnasium as gym
@@ -45,7 +44,7 @@ def _step(params, state, obs, action, old_log_prob, advantage, target, proposals
         ratio = jnp.exp(logpdf(action, NET(params["pi"], obs), std).sum(-1) - old_log_prob)
         surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - CLIP, 1 + CLIP) * advantage)
         ppo = -surrogate.mean() + ((NET(params["v"], obs)[:, 0] - target) ** 2).mean()
-        mean, mu, sd = NET(params["pi"], states), proposals.proxy_mean, proposals.proxy_std  # DAP, down to `return`
+        mean, mu, sd = NET(params["pi"], states), proposals.proxy_mean, proposals.proxy_std  # the two terms
         kl = (jnp.log(sd / std) + (std**2 + (mean - mu) ** 2) / (2 * sd**2) - 0.5).sum(-1)
         return ppo + LAMBDA_KL * kl.mean() - LAMBDA_AUX * logpdf(proposals.actions, mean[:, None], std).sum(-1).mean()
 
@@ -56,20 +55,19 @@ def _step(params, state, obs, action, old_log_prob, advantage, target, proposals
 def main(iterations: int = 30) -> None:
     """Train, and print the mean return of each iteration's episodes."""
     envs, rng, *keys = gym.make_vec("Pendulum-v1", ENVS), np.random.default_rng(0), *map(jax.random.key, (0, 1))
-    obs, act = (x.reshape(ROWS, -1) for x in _play(envs, _old_controller, 0.3, rng)[:2])  # DAP, down to `guide`
+    obs, act = (x.reshape(ROWS, -1) for x in _play(envs, _old_controller, 0.3, rng)[:2])  # the logs
     logs = ppo_dap.Logs(obs, act.clip(-2, 2), episode_ends=np.arange(1, ROWS + 1) % STEPS == 0)
-    prior = ppo_dap.fit_prior(logs, action_low=-2, action_high=2, width=64, max_steps=1000)
+    prior = ppo_dap.fit_prior(logs, action_low=-2, action_high=2, width=64, max_steps=400)
     guide = ppo_dap.Guide(prior, total_iterations=iterations, minibatch_size=MINIBATCH)
-    params = {"pi": INIT(keys[0], (-1, 3))[1], "v": INIT(keys[1], (-1, 3))[1], "log_std": jnp.zeros(1)}
-    state = ADAM.init(params)
+    state = ADAM.init(params := {"pi": INIT(keys[0], (3,))[1], "v": INIT(keys[1], (3,))[1], "log_std": jnp.zeros(1)})
     for iteration in range(iterations):
         pi, std = Partial(NET, params["pi"]), np.exp(params["log_std"])
         obs, act, rewards, following = _play(envs, pi, std, rng)
         values, next_values = (np.asarray(NET(params["v"], x))[..., 0] for x in (obs, following))
-        deltas = rewards + GAMMA * next_values - values  # V also follows the cut: no episode terminates
+        deltas = rewards + GAMMA * next_values - values  # no episode terminates, so V follows the cut too
         gae = lfilter([1], [1, -GAMMA * GAE_LAMBDA], deltas[:, ::-1])[:, ::-1]
-        normal, log_probs = (gae - gae.mean()) / gae.std(), logpdf(act, pi(obs), std).sum(-1)
-        columns = obs, act, log_probs, normal, gae + values, rewards, next_values
+        scaled, old = (gae - gae.mean()) / gae.std(), logpdf(act, pi(obs), std).sum(-1)
+        columns = obs, act, old, scaled, gae + values, rewards, next_values
         *rows, r, v = (np.asarray(x, np.float32).reshape(ROWS, *x.shape[2:]) for x in columns)
         proposals = guide(observations=rows[0], actions=rows[1].clip(-2, 2), rewards=r, next_values=v, terminated=0 * r)
         for i in rng.permuted(np.tile(np.arange(ROWS), (EPOCHS, 1)), axis=1).reshape(-1, MINIBATCH):

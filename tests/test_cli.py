@@ -89,10 +89,10 @@ def write_priors(folder):
     (folder / "prior-empty").write_bytes(b"")
     (folder / "prior-text").write_text("not a prior\n")
     save_file({"a": np.zeros(2)}, folder / "prior-foreign")
-    header = {"version": 2, "kind": "diffusion"}
-    save_file({"a": np.zeros(2)}, folder / "prior-newer", {"ppo-dap prior": json.dumps(header)})
-    header = {"version": 1, "kind": "flow"}
-    save_file({"a": np.zeros(2)}, folder / "prior-kind", {"ppo-dap prior": json.dumps(header)})
+    header = {"kind": "prior", "format": 2, "prior": "diffusion"}
+    save_file({"a": np.zeros(2)}, folder / "prior-newer", {"meta": json.dumps(header)})
+    header = {"kind": "prior", "format": 1, "prior": "flow"}
+    save_file({"a": np.zeros(2)}, folder / "prior-kind", {"meta": json.dumps(header)})
 
 
 def write_runs(folder):
@@ -200,14 +200,14 @@ BAD = {
     "prior: actions": (f"{DAP} @prior-two", "another task", "action_size 2", "Pendulum-v1 has action_size 1"),
     "prior: task": (f"{DAP} @prior-other", "logs of Swing-v0, not of Pendulum-v1"),
     "prior: bounds": (f"{DAP} @prior-bounds", "action bounds", "not those of Pendulum-v1"),
-    "prior: truncated": (f"{DAP} @prior-cut", "prior-cut is damaged or not a prior file"),
-    "prior: empty": (f"{DAP} @prior-empty", "prior-empty is damaged or not a prior file"),
-    "prior: text": (f"{DAP} @prior-text", "prior-text is damaged or not a prior file"),
-    "prior: foreign": (f"{DAP} @prior-foreign", "not a prior", "write one with `ppo-dap pretrain`"),
-    "prior: newer": (f"{DAP} @prior-newer", "prior format 2", "reads up to 1", "upgrade ppo-dap"),
+    "prior: truncated": (f"{DAP} @prior-cut", "prior-cut is not a whole prior file"),
+    "prior: empty": (f"{DAP} @prior-empty", "prior-empty is not a whole prior file"),
+    "prior: text": (f"{DAP} @prior-text", "prior-text is not a whole prior file"),
+    "prior: foreign": (f"{DAP} @prior-foreign", "not a prior", "`ppo-dap pretrain` writes one"),
+    "prior: newer": (f"{DAP} @prior-newer", "prior format 2", "reads up to 1", "update ppo-dap"),
     "prior: kind": (f"{DAP} @prior-kind", "unknown prior kind 'flow'", "diffusion"),
-    "prior: missing": (f"{DAP} @nothing", "no prior at", "no such file"),
-    "prior: folder": (f"{DAP} @other", "no prior at", "it is a folder"),
+    "prior: missing": (f"{DAP} @nothing", "no prior file at", "ppo-dap pretrain"),
+    "prior: folder": (f"{DAP} @other", "no prior file at", "ppo-dap pretrain"),
     # Names.
     "method": (f"train --task {TASK} --method ppo-dab --out out", "unknown method 'ppo-dab'", "did you mean 'ppo-dap'"),
     "task": ("train --task Hoper-v5 --method ppo --out out", "unknown task 'Hoper-v5'", "did you mean 'Hopper-v5'"),
@@ -244,7 +244,7 @@ BAD = {
     "top-k word": (f"{PPO} --top-k all", "--top-k", "must be a whole number or none, not 'all'"),
     "tensorboard": (f"{PPO} --tensorboard yes", "--tensorboard", "must be true or false, not 'yes'"),
     "learning-rate inf": (f"{PPO} --learning-rate inf", "learning_rate must be", "inf"),
-    "seed": (f"{PPO} --seed -1", "seed must be a number of 0 or more, not -1"),
+    "seed": (f"{PPO} --seed -1", "seed must be a number from 0 to 4294967295, not -1"),
     "large seed": (f"{PPO} --seed 99999999999999999999", "seed must be", "99999999999999999999"),
     "contradiction": (f"{PPO} --warm-start actor", "warm_start 'actor' contradicts method ppo", "'none'"),
     "pretrain seed": ("pretrain --logs @good.npz --task Pendulum-v1 --out out --seed -1", "seed", "-1"),
@@ -269,7 +269,7 @@ BAD = {
     "audit of no audit": ("audit @run", "has no audit.json"),
     "evaluate without policy": ("evaluate @run-policyless", "no policy file at"),
     "evaluate newer": ("evaluate @run-newer", "policy format 99", "reads up to", "update ppo-dap"),
-    "evaluate episodes": ("evaluate @run --episodes 0", "episodes must be a number above 0, not 0"),
+    "evaluate episodes": ("evaluate @run --episodes 0", "--episodes: must be a whole number above 0, not '0'"),
     "evaluate seed": ("evaluate @run --seed -1", "seed", "-1"),
     "evaluate task": ("evaluate @run --task CartPole-v1", "CartPole-v1", "Discrete(2)"),
     "evaluate dimensions": ("evaluate @run --task MountainCarContinuous-v0", "2", "3"),

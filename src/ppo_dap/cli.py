@@ -8,8 +8,10 @@ import dataclasses
 import functools
 import inspect
 import itertools
+import math
 import sys
 import typing
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
@@ -43,7 +45,7 @@ class Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0 done, 1 a violated check or a failed run, 2 bad input."""
-    parser = build_parser()
+    parser, warnings.showwarning = build_parser(), _show_warning
     try:
         options = parser.parse(sys.argv[1:] if arguments is None else arguments)
         if options.command is None:
@@ -59,6 +61,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("ppo-dap: interrupted", file=sys.stderr)
         return 1
+
+
+def _show_warning(message: Any, category: type, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
+    """A warning in one line, without the place in the code that it came from."""
+    print(f"ppo-dap: warning: {message}", file=sys.stderr)
 
 
 def build_parser() -> Parser:
@@ -96,7 +103,7 @@ def _from_logs_to_runs(command: Command) -> None:
     _logs_option(sub, True)
     sub.add_argument("--task", metavar="ID", help="task of the logs, where they do not say (gives the action bounds)")
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
-    sub.add_argument("--seed", type=int, default=0, help="seed of the fit (default: 0)")
+    sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit (default: 0)")
     sub.add_argument("--quiet", action="store_true", help="print the result alone")
 
     sub = command("train", commands.train_run, "Stage II: train a method on a task")
@@ -116,8 +123,8 @@ def _about_runs(command: Command) -> None:
     sub = command("evaluate", commands.evaluate, "returns of a run's deterministic policy")
     sub.add_argument("folder", metavar="RUN", help="run folder")
     sub.add_argument("--task", metavar="ID", help="another task of the same dimensions")
-    sub.add_argument("--episodes", type=int, default=10, help="(default: %(default)s)")
-    sub.add_argument("--seed", type=int, default=0, help="seed of the environments (default: 0)")
+    sub.add_argument("--episodes", type=_positive_count, default=10, help="(default: %(default)s)")
+    sub.add_argument("--seed", type=_seed, default=0, help="seed of the environments (default: 0)")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
     sub = command("audit", commands.audit, "verdict on a run by Definition 1; exit code 1 on a violation")
@@ -126,20 +133,45 @@ def _about_runs(command: Command) -> None:
 
     sub = command("summary", commands.summary, "ALC, return, cost and verdict of runs beside their paired PPO")
     sub.add_argument("folders", nargs="+", metavar="RUN", help="run folders")
-    sub.add_argument("--epochs", type=float, default=40, help="T of ALC@T, in 5k steps (default: %(default)s)")
+    sub.add_argument(
+        "--epochs", type=_positive_number, default=40.0, help="T of ALC@T, in 5k steps (default: %(default)s)"
+    )
     sub.add_argument("--json", action="store_true", help="print JSON")
 
     sub = command("collect", commands.collect, "log episodes of a run's policy")
     sub.add_argument("folder", metavar="RUN", help="run folder")
     sub.add_argument("--out", required=True, metavar="FILE", help=".npz to write")
     sub.add_argument(
-        "--steps", type=int, default=100_000, help="rows at least, in whole episodes (default: %(default)s)"
+        "--steps", type=_positive_count, default=100_000, help="rows at least, in whole episodes (default: %(default)s)"
     )
-    sub.add_argument("--seed", type=int, default=0, help="seed of environments and noise (default: 0)")
-    sub.add_argument("--noise", type=float, default=1.0, help="times the policy's own noise (default: %(default)s)")
+    sub.add_argument("--seed", type=_seed, default=0, help="seed of environments and noise (default: 0)")
+    sub.add_argument(
+        "--noise", type=_number_of_0_or_more, default=1.0, help="times the policy's own noise (default: %(default)s)"
+    )
 
     sub = command("methods", commands.methods, "the methods and what each of them uses (Table 3)")
     sub.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _number(kind: type, right: Callable[[Any], bool], what: str) -> Callable[[str], Any]:
+    """An option's type: a number for which `right` holds."""
+
+    def parse(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not right(value):
+            raise argparse.ArgumentTypeError(f"must be {what}, not {text!r}")
+        return value
+
+    return parse
+
+
+_seed = _number(int, lambda v: 0 <= v < 2**32, "a whole number from 0 to 4294967295")
+_positive_count = _number(int, lambda v: v > 0, "a whole number above 0")
+_positive_number = _number(float, lambda v: 0 < v < math.inf, "a number above 0")
+_number_of_0_or_more = _number(float, lambda v: 0 <= v < math.inf, "a number of 0 or more")
 
 
 def _logs_option(parser: Parser, required: bool) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from ppo_dap import config as configs
-from ppo_dap.errors import InputError
 from ppo_dap.training.manifest import prepare_jax
 
 
@@ -50,10 +49,13 @@ def pretrain(options: argparse.Namespace) -> int:
 
     logs = load_logs(options.logs, options.task)
     bounds: dict[str, Any] = {}
-    if logs.action_low is None and logs.task is not None:
+    if logs.task is not None:
+        from ppo_dap.logs import require_compatible
         from ppo_dap.tasks import describe
 
         spec = describe(logs.task)
+        sizes = {"observation_size": spec.observation_size, "action_size": spec.action_size}
+        require_compatible(logs, task=logs.task, **sizes)
         bounds = {"action_low": spec.action_low, "action_high": spec.action_high}
 
     def show(p: Any) -> None:
@@ -111,8 +113,6 @@ def evaluate(options: argparse.Namespace) -> int:
     from ppo_dap.training.evaluation import evaluate_policy
     from ppo_dap.training.run import load_run
 
-    if options.episodes < 1:
-        raise InputError(f"--episodes must be a number above 0, not {options.episodes}")
     run = load_run(options.folder)
     task = options.task or run.config["task"]
     row = evaluate_policy(run.policy, task, options.episodes, options.seed).row(run.evaluations[-1]["env_steps"])

@@ -8,6 +8,7 @@ letter, `tuned` is the best that our own studies found (docs/results.md says on 
 from __future__ import annotations
 
 import dataclasses
+import math
 import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -197,7 +198,8 @@ def replace(config: Config, **options: Any) -> Config:
     for name, value in options.items():
         if name not in owner:
             raise unknown("option", name, owner)
-        changes.setdefault(owner[name], {})[name] = value
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        changes.setdefault(owner[name], {})[name] = float(value) if whole and name in _FLOATS else value
     groups = {g: dataclasses.replace(getattr(config, g), **values) for g, values in changes.items()}
     return dataclasses.replace(config, **groups)
 
@@ -230,9 +232,10 @@ _RULES: dict[str, tuple[Any, str]] = {
     ),
     **dict.fromkeys(
         ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every",
-         "seed"),
+),
         _at_least_0,
     ),
+    "seed": (lambda v: 0 <= v < 2**32, "a number from 0 to 4294967295"),
     **dict.fromkeys(["proposal_fraction", "beta_anneal"], _share),
     **dict.fromkeys(("gamma", "gae_lambda"), (lambda v: 0 <= v <= 1, "a number from 0 to 1")),
     **dict.fromkeys(("displacement_cap", "top_k"), (lambda v: v is None or v > 0, "a number above 0, or None")),
@@ -258,6 +261,15 @@ def validate(config: Config) -> None:
         )
 
 
+_FLOATS = frozenset(
+    f.name
+    for cls in typing.get_type_hints(Config).values()
+    for f in dataclasses.fields(cls)
+    if float in (typing.get_args(typing.get_type_hints(cls)[f.name]) or (typing.get_type_hints(cls)[f.name],))
+)
+"""Fields that take a number; a whole one given for it becomes a float."""
+
+
 def _validate_field(name: str, value: Any, hint: Any) -> None:
     if typing.get_origin(hint) is Literal:
         if value not in typing.get_args(hint):
@@ -270,5 +282,6 @@ def _validate_field(name: str, value: Any, hint: Any) -> None:
     if not right_type:
         kinds = " or ".join("None" if t is type(None) else t.__name__ for t in allowed)
         raise InputError(f"{name} must be {kinds}, not {value!r}")
-    if name in _RULES and (value != value or not _RULES[name][0](value)):
+    finite = not isinstance(value, float) or math.isfinite(value)
+    if name in _RULES and not (finite and _RULES[name][0](value)):
         raise InputError(f"{name} must be {_RULES[name][1]}, not {value!r}")

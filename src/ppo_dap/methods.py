@@ -32,8 +32,8 @@ METHODS: dict[str, Method] = {
         Method("ppo-dap", "PPO-DAP (Ours)", "diffusion"),
         Method("ppo-dap-no-vg", "PPO-DAP (No-VG)", "diffusion", _NO_GUIDANCE),
         Method("ppo-dap-no-pet", "PPO-DAP (No-PET)", "diffusion", {"pet_frequency": 0}),
-        Method("ppo-dap-prior-kl-only", "PPO-DAP (Prior-KL-only)", "diffusion", {**_NO_GUIDANCE, "lambda_aux": 0}),
-        Method("ppo-dap-aux-only", "PPO-DAP (Aux-only)", "diffusion", {"lambda_kl": 0}),
+        Method("ppo-dap-prior-kl-only", "PPO-DAP (Prior-KL-only)", "diffusion", {**_NO_GUIDANCE, "lambda_aux": 0.0}),
+        Method("ppo-dap-aux-only", "PPO-DAP (Aux-only)", "diffusion", {"lambda_kl": 0.0}),
     )
 }
 ALIASES = {"diffusion-novg": "ppo-dap-no-vg"}

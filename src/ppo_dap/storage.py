@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,9 @@ from typing import Any
 import numpy as np
 
 from ppo_dap.errors import InputError
+
+MADE_BY = defaultdict(lambda: "ppo-dap train", {"prior": "ppo-dap pretrain"})
+"""The command that writes each kind of file."""
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
@@ -63,7 +67,7 @@ def read_tensors(path: Path, kind: str, newest: int) -> tuple[dict[str, np.ndarr
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
-        raise InputError(f"no {kind} file at {path}")
+        raise InputError(f"no {kind} file at {path}: `{MADE_BY[kind]}` writes one")
     try:
         with safe_open(path, framework="np") as file:
             meta = json.loads((file.metadata() or {}).get("meta", "{}"))
@@ -72,7 +76,7 @@ def read_tensors(path: Path, kind: str, newest: int) -> tuple[dict[str, np.ndarr
         raise InputError(f"{path} is not a whole {kind} file: {error}") from error
     if not isinstance(meta, dict) or meta.get("kind") != kind or not isinstance(meta.get("format"), int):
         found = meta.get("kind", "foreign safetensors") if isinstance(meta, dict) else "foreign safetensors"
-        raise InputError(f"{path} is not a {kind} file but a {found} file")
+        raise InputError(f"{path} is not a {kind} file but a {found} file: `{MADE_BY[kind]}` writes one")
     if meta["format"] > newest:
         raise InputError(
             f"{path} has {kind} format {meta['format']}, this version of ppo-dap reads up to {newest}: update ppo-dap"

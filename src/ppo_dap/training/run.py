@@ -41,7 +41,7 @@ class Run:
     @cached_property
     def config(self) -> dict[str, Any]:
         """`config.json`: the resolved settings and the manifest."""
-        return json.loads((self.folder / "config.json").read_text())
+        return _read_config(self.folder)
 
     @cached_property
     def policy(self) -> Policy:
@@ -71,6 +71,17 @@ class Run:
             raise InputError(f"{self.folder} has no audit.json: is it a run folder?")
         static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
         return static + audit.measured_claims(self.metrics, guided=self.config["prior_hash"] is not None)
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    path = folder / "config.json"
+    try:
+        stored = json.loads(path.read_text())
+        if not {"task", "method", "config"} <= stored.keys():
+            raise ValueError("it lacks task, method or config")
+        return stored
+    except (ValueError, AttributeError) as error:
+        raise InputError(f"{path} is damaged ({error}): it must be what `ppo-dap train` wrote") from error
 
 
 def load_run(folder: str | Path) -> Run:
@@ -208,7 +219,7 @@ def _check_folder(folder: Path, description: dict[str, Any], resume: bool) -> No
         return
     if not resume:
         raise InputError(f"out {folder} holds a run already: name a new folder, or resume it")
-    stored = json.loads(path.read_text())
+    stored = _read_config(folder)
     for name, value in description.items():
         if name == "config":
             for option, wanted in value.items():
