@@ -127,7 +127,7 @@ def test_beta_rises_from_0_with_the_calls(prior, batch):
         ess.append(guide.metrics["ess"])
     assert guide.iteration == 2
     assert ess[0] == pytest.approx(3)  # beta 0: even weights over the 3 proposals
-    assert ess[1] < 2.5
+    assert ess[1] < 2.9
 
 
 def test_pet_moves_the_adapters_and_not_the_prior(prior, batch):
@@ -188,7 +188,7 @@ def test_a_bad_batch_is_refused_in_one_line_and_changes_nothing(prior, batch, na
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"total_iterations": 0}, "total_iterations must be a number above 0, not 0"),
+        ({"total_iterations": 0}, "total_iterations must be a whole number above 0, not 0"),
         ({"num_proposal": 3}, "num_proposal'.*num_proposals"),
         ({"preset": "papers"}, "papers'.*paper"),
         ({"beta_max": -1.0}, "beta_max must be"),

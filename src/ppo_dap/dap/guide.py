@@ -86,7 +86,10 @@ def make_proposals(
     config: Config,
     diffusion: DiffusionConfig,
 ) -> tuple[GatedProposals, Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Step 3: proposals on a random subset of D_on's states; also Q's new running scale, and metrics."""
+    """Step 3: proposals on a random subset of D_on's states; also Q's new running scale, and metrics.
+
+    Among them `spr`, Eq. 12: the share of the proposals whose states come from the current on-policy batch.
+    """
     choose_key, propose_key = jax.random.split(key)
     index = choose_states(rows.weights, choose_key, num_proposal_states(rows.weights.shape[0], config))
     observations = rows.observations[index]

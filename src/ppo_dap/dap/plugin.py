@@ -36,8 +36,8 @@ class Guide:
 
         Q has a trunk of its own here, since this PPO's value network is not ours to read.
         """
-        if total_iterations < 1:
-            raise InputError(f"total_iterations must be a number above 0, not {total_iterations}")
+        if not isinstance(total_iterations, int) or total_iterations < 1:
+            raise InputError(f"total_iterations must be a whole number above 0, not {total_iterations!r}")
         self.config = configs.make(preset, **(options | {"q_trunk": "separate"}))
         self.prior, self.iteration, self._total = prior, 0, total_iterations
         self._moments = RunningMoments.create(prior.observation_size)
@@ -89,7 +89,9 @@ class Guide:
         self._moments = self._moments.update(np.asarray(rows.raw_observations)[np.asarray(rows.weights) > 0])
         self.iteration += 1
         self.metrics = {name: float(v) for name, v in (proposed | learned | adapted).items()}
-        return self._in_environment_units(gated.proposals)
+        # Rows in which no transition happened can fill up the subset; nobody else would know them from the others.
+        kept = np.flatnonzero(np.asarray(gated.gate))
+        return self._in_environment_units(jax.tree.map(lambda x: x[kept], gated.proposals))
 
     def _rows(self, observations, actions, rewards, next_values, terminated, valid) -> tuple[OnPolicy, Batch]:
         prior, ppo = self.prior, self.config.ppo

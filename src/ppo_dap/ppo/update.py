@@ -160,7 +160,8 @@ def improve_actor(
     """Step 4, the actor: `num_epochs` passes over D_on in shuffled minibatches, fewer when the KL rule stops them.
 
     `added` holds what `added_gradient` sees, with a multiple of the number of minibatches as leading axis; it is
-    shuffled and dealt out like D_on's rows, by a random stream of its own.
+    shuffled and dealt out like D_on's rows, by a random stream of its own. The metric `pgshare` is Eq. 13: the norm of
+    PPO's gradient over that of the whole.
     """
     num_minibatches = ppo.rollout_steps // ppo.minibatch_size
     old_log_std = actor.log_std
