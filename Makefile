@@ -20,8 +20,8 @@ lint: .venv/.ready  ## style, formatting and types
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-sample: .venv/.ready  ## make the shipped Hopper logs again and print their hash: 600k steps of PPO, then 40k rows of it
-	$(BIN)/ppo-dap train --task Hopper-v5 --method ppo --steps 600000 --seed 100 --out runs/hopper-behaviour --quiet
+sample: .venv/.ready  ## make the shipped Hopper logs again and print their hash: 300k steps of PPO, then 40k rows of it
+	$(BIN)/ppo-dap train --task Hopper-v5 --method ppo --steps 300000 --seed 100 --out runs/hopper-behaviour --quiet
 	$(BIN)/ppo-dap collect runs/hopper-behaviour --steps 40000 --out src/ppo_dap/logs/samples/hopper-medium.npz
 
 lock:  ## resolve pyproject.toml into constraints.txt; UPGRADE=--upgrade moves to the newest versions
