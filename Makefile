@@ -7,7 +7,7 @@ BIN := .venv/bin
 export NPROC = 1
 
 help:  ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "make %-12s%s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z-]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "make %-12s%s\n", $$1, $$2}'
 
 quickstart: .venv/.ready  ## fit a prior on the shipped logs, train PPO and PPO-DAP, compare them
 	$(BIN)/ppo-dap quickstart
@@ -23,6 +23,14 @@ lint: .venv/.ready  ## style, formatting and types
 sample: .venv/.ready  ## make the shipped Hopper logs again and print their hash: 300k steps of PPO, then 40k rows of it
 	$(BIN)/ppo-dap train --task Hopper-v5 --method ppo --steps 300000 --seed 100 --out runs/hopper-behaviour --quiet
 	$(BIN)/ppo-dap collect runs/hopper-behaviour --steps 40000 --out src/ppo_dap/logs/samples/hopper-medium.npz
+
+bench-peers: .venv/.ready .venv-peers/.ready  ## the benchmark with five other PPOs, in an environment of their own
+	$(BIN)/ppo-dap bench --peers .venv-peers/bin/python --json bench.json
+
+.venv-peers/.ready: benchmarks/peers/requirements.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --disable-pip-version-check --quiet -r benchmarks/peers/requirements.txt
+	@touch $@
 
 lock:  ## resolve pyproject.toml into constraints.txt; UPGRADE=--upgrade moves to the newest versions
 	$(PYTHON) -m venv --clear .venv/lock
@@ -42,4 +50,4 @@ lock:  ## resolve pyproject.toml into constraints.txt; UPGRADE=--upgrade moves t
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 
-.PHONY: help quickstart test lint sample lock
+.PHONY: help quickstart test lint sample bench-peers lock

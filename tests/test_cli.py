@@ -64,7 +64,6 @@ def write_logs(folder):
 
 
 def write_priors(folder):
-    import jax
     import jax.numpy as jnp
 
     from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
@@ -76,7 +75,7 @@ def write_priors(folder):
         moments = jnp.zeros(observation_size), jnp.ones(observation_size), jnp.ones(())
         high = np.full(action_size, high, np.float32)
         probe = np.zeros((2, observation_size), np.float32), np.zeros((2, action_size), np.float32)
-        denoiser = Denoiser.create(jax.random.key(0), config, *moments, action_size)
+        denoiser = Denoiser.create(np.random.default_rng(0), config, *moments, action_size)
         DiffusionPrior(denoiser, config, -high, high, task, "hash", {}, *probe).save(folder / name)
 
     save("prior", TASK)

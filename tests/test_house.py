@@ -15,11 +15,12 @@ PACKAGE = ROOT / "src" / "ppo_dap"
 # Top-level part of ppo_dap -> the other parts that it may import. A part that is not listed fails the test.
 _LEARNING = {"nets", "priors", "ppo", "dap"}
 _DATA = {"tasks", "logs"}
-_BASE = {"errors", "storage", "config", "methods"}
+_BASE = {"errors", "storage", "config", "prior_config", "methods"}
 ALLOWED = {
     "errors": set(),
     "storage": {"errors"},
     "config": {"errors"},
+    "prior_config": {"errors"},
     "methods": {"errors", "config"},
     "tasks": {"errors"},
     "logs": {"errors", "storage", "tasks"},

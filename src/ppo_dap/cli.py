@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from ppo_dap import commands
 from ppo_dap import config as configs
 from ppo_dap.errors import InputError, PPODAPError, unknown
+from ppo_dap.prior_config import DiffusionConfig
 
 
 class Parser(argparse.ArgumentParser):
@@ -105,6 +106,7 @@ def _from_logs_to_runs(command: Command) -> None:
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
     sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit (default: 0)")
     sub.add_argument("--quiet", action="store_true", help="print the result alone")
+    _field_options(sub.add_argument_group("the diffusion prior"), DiffusionConfig)
 
     sub = command("train", commands.train_run, "Stage II: train a method on a task")
     sub.add_argument("--task", required=True, metavar="ID", help="a Gymnasium id, such as Hopper-v5")
@@ -126,6 +128,18 @@ def _about_runs(command: Command) -> None:
     sub.add_argument("--episodes", type=_positive_count, default=10, help="(default: %(default)s)")
     sub.add_argument("--seed", type=_seed, default=0, help="seed of the environments (default: 0)")
     sub.add_argument("--json", action="store_true", help="print JSON")
+
+    sub = command("bench", commands.bench, "what PPO and the method cost on this machine, as ratios; tens of minutes")
+    sub.add_argument(
+        "--task", action="append", metavar="ID", help="again for more (default: Walker2d-v5, HalfCheetah-v5)"
+    )
+    sub.add_argument("--steps", type=_positive_count, default=81920, help="of each run (default: %(default)s)")
+    sub.add_argument("--repeats", type=_positive_count, default=3, help="medians are over these (default: %(default)s)")
+    sub.add_argument("--peers", metavar="PYTHON", help="interpreter that has the peers: see `make bench-peers`")
+    sub.add_argument(
+        "--sweep", metavar="CSV", help="instead: cost against each knob of the method, as a table and figure"
+    )
+    sub.add_argument("--json", metavar="FILE", help="write everything to FILE as well")
 
     sub = command("audit", commands.audit, "verdict on a run by Definition 1; exit code 1 on a violation")
     sub.add_argument("folder", metavar="RUN", help="run folder")
@@ -183,16 +197,20 @@ def _logs_option(parser: Parser, required: bool) -> None:
 def _config_options(parser: Parser) -> None:
     """A flag for every field of the config, by its name; what is not given stays with the preset."""
     for group, cls in typing.get_type_hints(configs.Config).items():
-        section = parser.add_argument_group(f"{group}: {(cls.__doc__ or '').splitlines()[0]}")
-        hints, texts = typing.get_type_hints(cls), field_docstrings(cls)
-        for f in dataclasses.fields(cls):
-            section.add_argument(
-                f"--{f.name.replace('_', '-')}",
-                type=functools.partial(_parse_value, hints[f.name]),
-                default=argparse.SUPPRESS,
-                metavar="X",
-                help=f"{texts[f.name]} (default: {f.default})".replace("%", "%%"),
-            )
+        _field_options(parser.add_argument_group(f"{group}: {(cls.__doc__ or '').splitlines()[0]}"), cls)
+
+
+def _field_options(section: Any, cls: type) -> None:
+    """A flag for every field of a dataclass; what is not given is not in the result."""
+    hints, texts = typing.get_type_hints(cls), field_docstrings(cls)
+    for f in dataclasses.fields(cls):
+        section.add_argument(
+            f"--{f.name.replace('_', '-')}",
+            type=functools.partial(_parse_value, hints[f.name]),
+            default=argparse.SUPPRESS,
+            metavar="X",
+            help=f"{texts[f.name]} (default: {f.default})".replace("%", "%%"),
+        )
 
 
 def field_docstrings(cls: type) -> dict[str, str]:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ppo_dap import config as configs
+from ppo_dap.errors import InputError
+from ppo_dap.prior_config import DiffusionConfig
 from ppo_dap.training.manifest import prepare_jax
 
 
@@ -44,6 +48,8 @@ def check_logs(options: argparse.Namespace) -> int:
 def pretrain(options: argparse.Namespace) -> int:
     """Stage I."""
     prepare_jax()
+    given = {f.name: getattr(options, f.name) for f in dataclasses.fields(DiffusionConfig) if f.name in options}
+    DiffusionConfig(**given)  # a bad option is told before JAX is imported
     from ppo_dap.logs import load_logs
     from ppo_dap.priors import fit_prior
 
@@ -65,7 +71,7 @@ def pretrain(options: argparse.Namespace) -> int:
             file=sys.stderr,
         )
 
-    prior = fit_prior(logs, seed=options.seed, progress=None if options.quiet else show, **bounds)
+    prior = fit_prior(logs, seed=options.seed, progress=None if options.quiet else show, **bounds, **given)
     prior.save(options.out)
     summary = prior.training
     print(
@@ -100,11 +106,24 @@ def train_run(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(last | {"audit": not violated}))
     else:
+        _print_profile(run.metrics)
         print(
             f"{options.out}: {last['env_steps']:,} steps, return {last['return_mean']:,.1f} over {last['episodes']} "
             f"episodes, audit {'VIOLATED: see `ppo-dap audit`' if violated else 'holds'}"
         )
     return 1 if violated or not run.finished else 0
+
+
+def _print_profile(metrics: Sequence[Mapping[str, Any]]) -> None:
+    """Where an iteration's time went: one line for the host, and one for what went on beside it."""
+    from ppo_dap.training.clock import profile
+
+    lines = profile(metrics)
+    for beside, label in ((False, "an iteration's {total:,.0f} ms"), (True, "meanwhile, on the device")):
+        parts = [line for line in lines if line.beside == beside and line.seconds > 0]
+        if parts:
+            total = sum(line.seconds for line in parts) / (len(metrics) - 1) * 1e3
+            print(label.format(total=total) + ": " + ", ".join(f"{line.name} {line.share:.0%}" for line in parts))
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -123,6 +142,28 @@ def evaluate(options: argparse.Namespace) -> int:
             f"{task}: return {row['return_mean']:,.1f} +- {row['return_std']:,.1f} over {row['episodes']} episodes, "
             f"length {row['length_mean']:,.0f}"
         )
+    return 0
+
+
+def bench(options: argparse.Namespace) -> int:
+    """The benchmark."""
+    from ppo_dap.study.bench import bench, print_bench
+    from ppo_dap.study.sweep import sweep
+    from ppo_dap.tasks import describe
+
+    tasks = options.task or ["Walker2d-v5", "HalfCheetah-v5"]
+    for task in tasks:
+        describe(task)
+    if options.sweep is not None:
+        sweep(tasks[0], Path(options.sweep), functools.partial(print, flush=True))
+        return 0
+    peers = None if options.peers is None else Path(options.peers)
+    if peers is not None and not peers.is_file():
+        raise InputError(f"peers {peers} is no interpreter: `make bench-peers` makes one")
+    figures = bench(tasks, options.steps, options.repeats, peers, functools.partial(print, flush=True))
+    print_bench(figures)
+    if options.json is not None:
+        Path(options.json).write_text(json.dumps(figures, indent=1) + "\n")
     return 0
 
 

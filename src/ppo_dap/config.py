@@ -159,6 +159,9 @@ class RunConfig:
     """Iterations between checkpoints; environments restart there, in every run."""
     threads: int = 1
     """Threads that step the environments."""
+    pin_core: bool = True
+    """Keep a run with one thread on a core that no other run has claimed, so that handing over to the environments'
+    thread wakes no other core."""
     tensorboard: bool = True
     """Write TensorBoard event files."""
 
@@ -181,7 +184,7 @@ class Config:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
-    "tuned": {"lambda_kl": 0.05, "lambda_aux": 0.1, "kl_rule": "monitor"},
+    "tuned": {"lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "kl_rule": "monitor"},
 }
 
 

@@ -50,11 +50,14 @@ def tree_to_tensors(tree: Any, prefix: str) -> dict[str, np.ndarray]:
 
 
 def tree_from_tensors(like: Any, tensors: Mapping[str, np.ndarray], prefix: str, source: object) -> Any:
-    """`like` with the arrays that `tree_to_tensors` wrote; raises `InputError` where names or shapes differ."""
+    """`like` (arrays or their shapes) with the arrays that `tree_to_tensors` wrote; raises `InputError` where names or
+    shapes differ.
+    """
     import jax
 
     loaded = []
-    for name, leaf in tree_to_tensors(like, prefix).items():
+    for path, leaf in jax.tree_util.tree_leaves_with_path(like):
+        name = prefix + jax.tree_util.keystr(path)
         if name not in tensors or tensors[name].shape != leaf.shape:
             found = tensors[name].shape if name in tensors else "nothing"
             raise InputError(f"{source} has {found} for {name} where {leaf.shape} is needed: was it another config?")

@@ -18,11 +18,13 @@ from ppo_dap.ppo.update import Normaliser, Settings
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 from ppo_dap.training import algorithm
 from ppo_dap.training.algorithm import Frozen, Schedule, Stages, create_learner
+from ppo_dap.training.draws import draw, num_parts
 
 OBS, ACT, TIME, ENVS = 3, 2, 16, 4
 ROWS = TIME * ENVS
 DIFFUSION = DiffusionConfig(width=8, depth=2)
-NORMALISER = Normaliser(jnp.zeros(OBS), jnp.ones(OBS), jnp.ones(()))
+NORMALISER = Normaliser(jnp.zeros(OBS), jnp.ones(OBS))
+REWARD_STD = jnp.ones(())
 _SMALL = {
     "num_envs": ENVS, "rollout_steps": ROWS, "minibatch_size": 16, "num_epochs": 2, "hidden_size": 8,
     "q_hidden_size": 8, "num_proposals": 3, "sampler_steps": 2, "pet_minibatch_size": 16, "adapter_rank": 2,
@@ -35,15 +37,15 @@ def small_config(**options):
 
 
 def filled(create, seed, scale=0.5):
-    """The module that `create(key)` makes, with random numbers of spread `scale`: nothing to compile."""
-    shapes, rng = jax.eval_shape(create, jax.random.key(0)), np.random.default_rng(seed)
+    """The module that `create(rng)` makes, with random numbers of spread `scale`: nothing to compile."""
+    shapes, rng = jax.eval_shape(lambda: create(np.random.default_rng(0))), np.random.default_rng(seed)
     return jax.tree.map(lambda s: jnp.asarray(scale * rng.standard_normal(s.shape), jnp.float32), shapes)
 
 
 @functools.cache
 def small_denoiser():
     moments = jnp.zeros(OBS), jnp.ones(OBS), jnp.asarray(0.5)
-    fresh = filled(lambda key: Denoiser.create(key, DIFFUSION, *moments, ACT), 5, 0.2)
+    fresh = filled(lambda rng: Denoiser.create(rng, DIFFUSION, *moments, ACT), 5, 0.2)
     return changed(fresh, observation_mean=moments[0], observation_std=moments[1], sigma_data=moments[2])
 
 
@@ -54,11 +56,11 @@ def small_frozen():
 
 
 def learner_of(config, guided=True):
-    return create_learner(jax.random.key(0), (OBS, ACT), config, small_denoiser() if guided else None)
+    return create_learner((OBS, ACT), config, small_denoiser() if guided else None)
 
 
 def rollout_of(actor, iteration=0):
-    """What a Collector would return in `iteration`; an eighth of the rows is masked, some steps end an episode."""
+    """What a Collector would collect in `iteration`: an eighth of the rows is masked, some steps end an episode."""
     rng = np.random.default_rng(100 + iteration)
     grid = (TIME, ENVS)
     observations, successors = rng.standard_normal((2, *grid, OBS)).astype(np.float32)
@@ -81,6 +83,20 @@ def rollout_of(actor, iteration=0):
     return Rollout(**{name: jnp.asarray(array) for name, array in arrays.items()})
 
 
+def parts_of(rollout, config):
+    """The rollout in the parts that a run would collect it in."""
+    count = num_parts(config)
+    split = jax.tree.map(lambda x: x.reshape(count, -1, *x.shape[1:]), rollout)
+    return [jax.tree.map(lambda x, i=i: x[i], split) for i in range(count)]
+
+
+def iterated(iterate, learner, frozen, rollout, schedule, stages, config, iteration=0):
+    """One iteration of `iterate` on a rollout as above, with the random numbers that a run would draw for it."""
+    draws = draw(config, iteration, ACT, learner.guide is not None)
+    parts = parts_of(rollout, config)
+    return iterate(learner, frozen, parts, NORMALISER, lambda: REWARD_STD, schedule, draws, stages)
+
+
 def schedule_of(iteration=0, lambda_kl=0.05, lambda_aux=0.1, guided=True, pet_steps=2):
     numbers = [jnp.asarray(x, jnp.float32) for x in (3e-3, jnp.inf, lambda_kl, lambda_aux, 0.7)]
     weights = Weights(*numbers[2:4]) if guided else ()
@@ -89,13 +105,13 @@ def schedule_of(iteration=0, lambda_kl=0.05, lambda_aux=0.1, guided=True, pet_st
 
 
 def with_fault(fault):
-    """`update` in which `fault(name, stage, arguments, seen, frozen)` runs each stage and may tamper with it.
+    """`iterate` in which `fault(name, stage, arguments, seen, frozen)` runs each stage and may tamper with it.
 
-    `seen` maps the names of the stages that ran before to their (arguments, result).
+    `seen` maps the names of the stages that ran before to their last (arguments, result).
     """
 
-    def faulty(learner, frozen, rollout, normaliser, schedule, key, stages):
-        seen = {"stages": stages, "rollout": rollout}
+    def faulty(learner, frozen, rollout, normaliser, reward_std, schedule, draws, stages, run=None):
+        seen = {"stages": stages}
         names = {id(stage): name for name, stage in vars(stages).items()}
 
         def between(_, stage, *arguments):
@@ -104,7 +120,7 @@ def with_fault(fault):
             seen[name] = arguments, result
             return result
 
-        return algorithm.update(learner, frozen, rollout, normaliser, schedule, key, stages, between)
+        return algorithm.iterate(learner, frozen, rollout, normaliser, reward_std, schedule, draws, stages, between)
 
     return faulty
 

@@ -9,7 +9,7 @@ import pytest
 
 from dap.dap_made import ACT, DIFFUSION, OBS, bits, quick_jit, small_denoiser
 from ppo_dap.config import AdaptationConfig
-from ppo_dap.dap.adaptation import ADAM, PETData, adapt, steps_until
+from ppo_dap.dap.adaptation import ADAM, PETData, PETDraws, adapt, steps_until
 from ppo_dap.dap.objective import Batch, provenance
 from ppo_dap.nets.adapters import init_adapters
 
@@ -31,7 +31,10 @@ def rows(states):
 
 @pytest.fixture(scope="module")
 def pet(states):
-    """(rows, steps, kind) -> start, result of `adapt`; D_on is `states` with ids from 64 on."""
+    """(rows, steps, kind) -> start, result of `adapt`; D_on is `states` with ids from 64 on.
+
+    From step `changed` on the random numbers are others.
+    """
     batch = Batch(jnp.asarray(64, jnp.int32), jnp.asarray(states), jnp.asarray(WEIGHTS, jnp.float32))
     config = AdaptationConfig(pet_minibatch_size=16, pet_learning_rate=1e-3)
     run = quick_jit(
@@ -40,10 +43,12 @@ def pet(states):
         )
     )  # fmt: skip
 
-    def adapted(rows, steps, kind="lora"):
-        start = init_adapters(jax.random.key(1), small_denoiser(), kind, 2)
-        num_steps = jnp.asarray(steps, jnp.int32)
-        return start, run(small_denoiser(), start, ADAM.init(start), rows, jax.random.key(2), num_steps)
+    def adapted(rows, steps, kind="lora", changed=None):
+        start = init_adapters(np.random.default_rng(1), small_denoiser(), kind, 2)
+        draws = PETDraws.make(np.random.default_rng(2), ACT, 400, config)  # 40 steps
+        if changed is not None:
+            draws = jax.tree.map(lambda x: np.concatenate([x[:changed], 1 - x[changed:]]), draws)
+        return start, run(small_denoiser(), start, ADAM.init(start), rows, draws, jnp.asarray(steps, jnp.int32))
 
     return adapted
 
@@ -68,6 +73,12 @@ def test_only_adapters_come_back(pet, rows):
     assert jax.tree.structure(adapters) == jax.tree.structure(start)
     assert jax.tree.structure(optimizer.mu) == jax.tree.structure(start)
     assert jax.tree.structure(optimizer.nu) == jax.tree.structure(start)
+
+
+def test_each_step_uses_its_own_draws(pet, rows):
+    (_, (plain, *_)), (_, (same, *_)), (_, (other, *_)) = (pet(rows, 3, changed=c) for c in (None, 3, 2))
+    assert bits(same) == bits(plain)
+    assert bits(other) != bits(plain)
 
 
 def poisoned(rows, index):
@@ -103,3 +114,15 @@ def test_fractions_of_a_step_are_not_lost(frequency, updates):
     each = np.diff([steps_until(i, frequency, updates) for i in range(101)])
     assert each.sum() == frequency * updates  # f per 100 updates, over 100 iterations
     assert each.max() - each.min() <= 1
+
+
+@pytest.mark.parametrize(("frequency", "updates"), [(10, 80), (0, 80), (1, 80), (3, 7), (1, 1), (7, 30)])
+def test_every_step_has_draws_of_its_own(frequency, updates):
+    most = max(np.diff([steps_until(i, frequency, updates) for i in range(101)]))
+    config = AdaptationConfig(pet_frequency=frequency, pet_minibatch_size=4)
+    draws = PETDraws.make(np.random.default_rng(0), ACT, updates, config)
+    steps, *rest = draws.rows.shape
+    assert steps >= most
+    assert [x.shape for x in jax.tree.leaves(draws)] == [(steps, 4), (steps, 4), (steps, 4, ACT)]
+    assert rest == [4]
+    assert len(np.unique(draws.rows)) == draws.rows.size

@@ -12,9 +12,12 @@ from dap.dap_made import (
     DIFFUSION,
     NORMALISER,
     OBS,
+    REWARD_STD,
     ROWS,
     changed,
+    iterated,
     learner_of,
+    parts_of,
     quick_stages,
     rollout_of,
     schedule_of,
@@ -23,10 +26,10 @@ from dap.dap_made import (
 )
 from ppo_dap.dap import audit, guide, objective
 from ppo_dap.dap.dataflow import Flow
-from ppo_dap.dap.guide import on_policy
 from ppo_dap.dap.objective import proposal_terms
 from ppo_dap.training import proof
-from ppo_dap.training.algorithm import Stages, update
+from ppo_dap.training.algorithm import Stages, iterate
+from ppo_dap.training.draws import draw
 
 RATIO, ADVANTAGES, V, PET, POLICY, REST = [row[1] for row in audit.FORBIDDEN]
 FRESH = "every row of the actor update is of the current batch (share)"
@@ -56,7 +59,7 @@ def tamper(stage_name, edit):
 
 
 def proposals_of(seen):
-    return seen["propose"][1][0].proposals
+    return seen["gate"][1][0].proposals
 
 
 def offline_rows_in_the_actor_loss(arguments, seen, frozen):
@@ -75,9 +78,10 @@ def proposals_in_the_ratio(arguments, seen, frozen):
 
 
 def advantages_from_rewards_of_proposals(arguments, seen, frozen):
-    rollout = changed(seen["rollout"], rewards=seen["rollout"].rewards + jnp.mean(proposals_of(seen).proxy_mean))
-    (critic, _, normaliser, first_id), _ = seen["advantages"]
-    rows, _, _ = seen["stages"].advantages(critic, rollout, normaliser, first_id)
+    (critic, parts, *rest), _ = seen["advantages"]
+    bonus = jnp.mean(proposals_of(seen).proxy_mean)
+    parts = [changed(part, rewards=part.rewards + bonus) for part in parts]
+    rows, _, _ = seen["stages"].advantages(critic, parts, *rest)
     return replaced(arguments, 2, rows)
 
 
@@ -134,7 +138,7 @@ def violated(claims):
 def proved(learner, frozen, config, stages, fault=None):
     with pytest.MonkeyPatch.context() as patch:
         if fault is not None:
-            patch.setattr(proof, "update", with_fault(fault))
+            patch.setattr(proof, "iterate", with_fault(fault))
         return proof.prove(learner, frozen, config, stages)
 
 
@@ -175,35 +179,29 @@ def test_qs_gradient_in_vs_trunk_is_found(frozen):
     assert violated(proved(learner_of(shared), frozen, shared, Stages(shared, DIFFUSION))) == {V}
 
 
-def actor_gradient_into_the_prior(config):
+def actor_gradient_into_the_prior(name, stage, arguments, seen, frozen):
     """PET's result less the actor loss's gradient in the adapters, which the code blocks."""
+    result = stage(*arguments)
+    if name != "adapt":
+        return result
+    (state, *inputs), _ = seen["propose"]
+    (_, _, batch), _ = seen["gate"]
+    _, (actor, _, _) = seen["actor"]
+    weights = objective.Weights(jnp.float32(1), jnp.float32(1))
 
-    def fault(name, stage, arguments, seen, frozen):
-        result = stage(*arguments)
-        if name != "adapt":
-            return result
-        (state, denoiser, critic, rows, batch, beta, key), _ = seen["propose"]
-        _, (actor, _, _) = seen["actor"]
-        weights = objective.Weights(jnp.float32(1), jnp.float32(1))
+    def actor_loss(adapters):
+        proposed = seen["stages"].propose(changed(state, adapters=adapters), *inputs)
+        gated, *_ = seen["stages"].gate(state, [proposed], batch)
+        return proposal_terms(actor, gated, weights)[0]
 
-        def actor_loss(adapters):
-            current = changed(state, adapters=adapters)
-            gated, *_ = guide.make_proposals(
-                current, denoiser, critic, rows, batch, beta, key, config=config, diffusion=DIFFUSION
-            )
-            return proposal_terms(actor, gated, weights)[0]
-
-        gradient = jax.grad(actor_loss)(state.adapters)
-        return jax.tree.map(lambda a, g: a - g, result[0], gradient), *result[1:]
-
-    return fault
+    gradient = jax.grad(actor_loss)(state.adapters)
+    return jax.tree.map(lambda a, g: a - g, result[0], gradient), *result[1:]
 
 
 def test_an_unblocked_gradient_into_the_prior_is_found(learner, frozen, config, traceable, monkeypatch):
-    fault = actor_gradient_into_the_prior(config)
-    assert (
-        violated(proved(learner, frozen, config, traceable, fault)) == set()
-    )  # blocked: the gradient is nothing at all
+    fault = actor_gradient_into_the_prior
+    # Blocked: the gradient is nothing at all.
+    assert violated(proved(learner, frozen, config, traceable, fault)) == set()
     monkeypatch.setattr(jax.lax, "stop_gradient", lambda x: x)
     claims = proved(learner, frozen, config, Stages(config, DIFFUSION), fault)
     assert violated(claims) == {PET}
@@ -220,12 +218,12 @@ def test_a_program_in_which_the_tags_are_missing_proves_nothing():
 
 
 def measured(learner, frozen, stages, fault=None, iterations=(0,), rollout=rollout_of):
-    """Metrics of updates that all start from `learner`, one an iteration."""
-    run = update if fault is None else with_fault(fault)
+    """Metrics of iterations that all start from `learner`."""
+    run = iterate if fault is None else with_fault(fault)
     rows = []
     for i in iterations:
         given = rollout(learner.ppo.actor, i)
-        _, metrics = run(learner, frozen, given, NORMALISER, schedule_of(i), jax.random.key(i), stages)
+        _, metrics = iterated(run, learner, frozen, given, schedule_of(i), stages, small_config(), i)
         rows.append({name: float(value) for name, value in metrics.items()})
     return rows
 
@@ -250,7 +248,7 @@ def test_pgshare_is_ppos_gradient_over_the_actors(learner, frozen, stages, confi
     for weight in (0.0, 1e-9, 1e6):
         schedule = schedule_of(lambda_kl=weight, lambda_aux=weight)
         rollout = rollout_of(learner.ppo.actor)
-        metrics = update(learner, frozen, rollout, NORMALISER, schedule, jax.random.key(0), stages)[1]
+        metrics = iterated(iterate, learner, frozen, rollout, schedule, stages, config)[1]
         shares.append(float(metrics["pgshare"]))
     assert shares[:2] == pytest.approx([1, 1], rel=1e-4)
     assert shares[2] < 1e-4
@@ -318,13 +316,18 @@ def test_logged_rows_in_pet_are_found(learner, frozen, stages):
 def test_spr_is_1_when_every_state_gets_proposals(frozen):
     everything = small_config(proposal_fraction=1.0)
     learner, stages = learner_of(everything), quick_stages(everything)
-    (rollout, key) = rollout_of(learner.ppo.actor), jax.random.key(0)
+    rollout, draws = rollout_of(learner.ppo.actor), draw(everything, 0, ACT, True)
     assert not rollout.valid.all()
-    rows, batch, _ = stages.advantages(learner.ppo.critic, rollout, NORMALISER, jnp.int32(0))
+    parts, critic = parts_of(rollout, everything), learner.ppo.critic
+    rows, batch, _ = stages.advantages(critic, parts, NORMALISER, REWARD_STD, jnp.int32(0))
     assert len(rows.weights) == ROWS
-    gated, _, metrics = stages.propose(
-        learner.guide, frozen.denoiser, learner.ppo.critic, on_policy(rows), batch, jnp.float32(1), key
-    )
+    proposed = [
+        stages.propose(learner.guide, frozen.denoiser, critic, part, NORMALISER, jnp.float32(1), numbers)
+        for part, numbers in zip(parts, draws.proposals, strict=True)
+    ]
+    gated, _, metrics = stages.gate(learner.guide, proposed, batch)
+    assert sorted(gated.proposals.state_ids.tolist()) == list(range(ROWS))
+    np.testing.assert_array_equal(gated.gate, rollout.valid.ravel()[gated.proposals.state_ids])
     assert gated.proposals.observations.shape[1:] == (OBS,)
     assert gated.proposals.actions.shape[2:] == (ACT,)
     assert float(metrics["spr"]) == 1

@@ -91,7 +91,7 @@ def test_alpha_schedule():
 
 @pytest.mark.parametrize("own_trunk", [False, True])
 def test_drift_is_alpha_times_the_finite_difference_gradient_of_q(own_trunk):
-    q = filled(lambda key: QFunction.create(key, 3, 2, 4, 8, own_trunk), 0)
+    q = filled(lambda rng: QFunction.create(rng, 3, 2, 4, 8, own_trunk), 0)
     features, x = NOISE[:, 0, :4], NOISE[..., 4:]
     config = ProposalConfig(guidance_cap=100.0)
     drift = np.asarray(quick_jit(lambda x: q_drift(q, features, 5.0, config)(x, jnp.float32(2.0)))(x))

@@ -44,7 +44,7 @@ def weights_of(kl, aux, dtype=jnp.float32):
 
 @pytest.fixture(scope="module")
 def actor():
-    return filled(lambda key: Actor.create(key, 3, 2, 4), 7)
+    return filled(lambda rng: Actor.create(rng, 3, 2, 4), 7)
 
 
 terms, gradient_of = jax.jit(proposal_terms), jax.jit(proposal_gradient)

@@ -127,7 +127,7 @@ def test_beta_rises_from_0_with_the_calls(prior, batch):
         ess.append(guide.metrics["ess"])
     assert guide.iteration == 2
     assert ess[0] == pytest.approx(3)  # beta 0: even weights over the 3 proposals
-    assert ess[1] < 2.9
+    assert ess[1] < 2.95
 
 
 def test_pet_moves_the_adapters_and_not_the_prior(prior, batch):

@@ -11,7 +11,16 @@ from scipy.stats import chisquare
 from dap.dap_made import DIFFUSION, OBS, bits, quick_jit, slope_q, small_denoiser
 from ppo_dap.config import ProposalConfig
 from ppo_dap.dap import proposals as module
-from ppo_dap.dap.proposals import States, acceptance, choose_states, gaussian_proxy, high_q_rate, propose
+from ppo_dap.dap.proposals import (
+    ProposalDraws,
+    States,
+    acceptance,
+    choose_states,
+    gaussian_proxy,
+    high_q_rate,
+    propose,
+    resample,
+)
 from ppo_dap.nets.adapters import init_adapters
 
 SLOPE = np.array([1.0, -0.5])
@@ -32,7 +41,9 @@ def states(raw):
 
 def run(function, given, seed=0, beta=1.0, spread=1.0, adapters=None, q=Q, **options):
     config = ProposalConfig(**{"num_proposals": 4, "sampler_steps": 4, **options})
-    numbers = jax.random.key(seed), jnp.float32(beta), jnp.float32(spread)
+    count = len(given.state_ids)
+    draws = ProposalDraws.make(np.random.default_rng(seed), count, count, len(SLOPE), config)
+    numbers = draws, jnp.float32(beta), jnp.float32(spread)
     return function(small_denoiser(), adapters, q, given, *numbers, diffusion=DIFFUSION, config=config)
 
 
@@ -44,8 +55,9 @@ def made(**options):
 def resampled(candidates, **options):
     """D_syn from `candidates` (n, 4, 2) in place of the prior's samples: they come in as what the prior reads."""
 
-    def samples(denoiser, adapters, raw, condition, key, num, diffusion, **_):
-        return raw.reshape(len(raw), num, -1), jnp.zeros((len(raw), num))
+    def samples(denoiser, adapters, raw, condition, noise, *_, **__):
+        shape = noise.shape[1:]
+        return raw.reshape(shape), jnp.zeros(shape[:2])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "sample_actions", samples)
@@ -79,6 +91,43 @@ def test_resampling_follows_the_energy_weights(options, temperature):
     assert chisquare(counts[expected > 0], expected[expected > 0]).pvalue > 1e-3
     # The same draws are not what other weights would give: the test can tell.
     assert chisquare(counts).pvalue < 1e-9
+
+
+RESAMPLE_WEIGHTS = np.array([[0.0, 0.1, 0.0, 0.6, 0.3, 0.0], [0.5, 0, 0, 0, 0, 0.5], [0, 0, 1.0, 0, 0, 0]], np.float32)
+
+
+def test_resample_has_the_frequencies_of_the_weights():
+    uniform = np.random.default_rng(0).random((3, 20_000), dtype=np.float32)
+    chosen = np.asarray(resample(jnp.asarray(RESAMPLE_WEIGHTS), jnp.asarray(uniform)))
+    for row, weights in zip(chosen, RESAMPLE_WEIGHTS, strict=True):
+        counts = np.bincount(row, minlength=6)
+        assert (counts[weights == 0] == 0).all()
+        np.testing.assert_allclose(counts / 20_000, weights, atol=5 * np.sqrt(0.25 / 20_000))
+        # Equally many of other weights would not pass for these.
+        assert chisquare(counts).pvalue < 1e-9
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 0.99999994, 1.0000001])
+def test_resample_is_right_at_the_ends_of_the_interval(scale):
+    """0, the largest float32 below 1, and weights whose sum rounding has left a little off 1."""
+    ends = jnp.broadcast_to(jnp.asarray([0.0, np.nextafter(np.float32(1), np.float32(0))]), (3, 2))
+    chosen = resample(jnp.asarray(scale * RESAMPLE_WEIGHTS), ends)
+    np.testing.assert_array_equal(chosen, [[1, 4], [0, 5], [2, 2]])
+
+
+def test_resample_never_lands_on_weight_0_whatever_the_rounding():
+    """Sums of many weights of all sizes round; the first and the last candidates have none."""
+    rng = np.random.default_rng(1)
+    weights = np.exp(8 * rng.standard_normal((2000, 30)))
+    weights[:, :3] = weights[:, -3:] = 0
+    weights *= rng.random(weights.shape) < 0.7
+    weights[:, 10] += 1e-6
+    weights = np.float32(weights / weights.sum(1, keepdims=True))
+    below = 1 - np.float32(2.0**-24) * np.arange(1, 9)
+    ends = np.broadcast_to(np.float32([0.0, *below, 1e-30, 0.5]), (2000, 11))
+    between = np.minimum(np.cumsum(weights, axis=1), below[0])  # where one candidate's share ends and the next begins
+    chosen = np.asarray(resample(jnp.asarray(weights), jnp.asarray(np.concatenate([ends, between], axis=1))))
+    assert (np.take_along_axis(weights, chosen, axis=1) > 0).all()
 
 
 def test_beta_0_resamples_evenly():
@@ -166,13 +215,14 @@ def test_displacement_cap(sampler):
 
 
 def test_no_gradient_of_a_proposal_reaches_the_prior(monkeypatch):
-    adapters = jax.tree.map(lambda x: x + 0.1, init_adapters(jax.random.key(1), small_denoiser(), "lora", 2))
+    adapters = jax.tree.map(lambda x: x + 0.1, init_adapters(np.random.default_rng(1), small_denoiser(), "lora", 2))
     given = states(np.ones((4, OBS)))
     config = ProposalConfig(num_proposals=3, sampler_steps=2, q_scale="none")
+    draws = jax.tree.map(jnp.asarray, ProposalDraws.make(np.random.default_rng(0), 4, 4, len(SLOPE), config))
 
     def gradients():
         def total(prior):
-            numbers = jax.random.key(0), jnp.float32(1), jnp.float32(1)
+            numbers = draws, jnp.float32(1), jnp.float32(1)
             proposals, metrics = propose(*prior, Q, given, *numbers, diffusion=DIFFUSION, config=config)
             return jnp.sum(proposals.actions**3 + proposals.proxy_std[:, None]) + metrics["ess"]
 
@@ -185,14 +235,15 @@ def test_no_gradient_of_a_proposal_reaches_the_prior(monkeypatch):
     assert gradients() == [True, True]
 
 
-def test_proposals_are_reproducible_and_differ_by_key():
+def test_proposals_are_reproducible_and_differ_by_draws():
     first, again, other = (bits(made(seed=seed, guidance="energy", q_scale="none")[0].actions) for seed in (1, 1, 2))
     assert first == again != other
 
 
 def test_states_are_chosen_evenly_without_repeats_from_the_rows_with_weight():
     weights = jnp.asarray([1.0, 0, 1, 1, 0, 1, 1, 1])
-    drawn = np.asarray(jax.vmap(lambda k: choose_states(weights, k, 3))(jax.random.split(jax.random.key(0), 4000)))
+    uniform = jnp.asarray(np.random.default_rng(0).random((4000, 8), dtype=np.float32))
+    drawn = np.asarray(jax.vmap(lambda u: choose_states(weights, u, 3))(uniform))
     assert all(len({*row}) == 3 for row in drawn[:200].tolist())
     counts = np.bincount(drawn.ravel(), minlength=8)
     assert (counts[[1, 4]] == 0).all()

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,13 +10,14 @@ from dap.dap_made import bits, changed, filled, quick_jit
 from ppo_dap.config import QConfig
 from ppo_dap.dap.q_learning import ADAM, QData, fit_q, trainable
 from ppo_dap.nets.critic import Critic, QFunction, q_features
+from ppo_dap.ppo.update import draw_orders
 
 ROWS = 256
 
 
 @pytest.fixture(scope="module")
 def critic():
-    return filled(lambda key: Critic.create(key, 2, 8), 0)
+    return filled(lambda rng: Critic.create(rng, 2, 8), 0)
 
 
 def target(states, actions):
@@ -40,9 +40,10 @@ def fit(critic):
 
     def run(rows, trunk):
         config = QConfig(q_trunk=trunk, q_epochs=150, q_learning_rate=1e-2, q_hidden_size=16)
-        q = filled(lambda key: QFunction.create(key, 2, 1, 8, 16, trunk == "separate"), 2)
+        q = filled(lambda rng: QFunction.create(rng, 2, 1, 8, 16, trunk == "separate"), 2)
         compiled.setdefault(trunk, quick_jit(partial(fit_q, minibatch_size=64, config=config)))
-        return compiled[trunk](q, critic, ADAM.init(trainable(q, critic, config)), rows, jax.random.key(3))
+        orders = draw_orders(np.random.default_rng(3), config.q_epochs, ROWS)
+        return compiled[trunk](q, critic, ADAM.init(trainable(q, critic, config)), rows, orders)
 
     return run
 

@@ -3,12 +3,11 @@
 import copy
 from itertools import pairwise
 
-import jax
 import numpy as np
 import pytest
 
-from dap.dap_made import NORMALISER, bits, learner_of, rollout_of, schedule_of
-from ppo_dap.training.algorithm import Stages, update
+from dap.dap_made import bits, iterated, learner_of, rollout_of, schedule_of
+from ppo_dap.training.algorithm import Stages, iterate
 
 ITERATIONS = 5
 
@@ -20,7 +19,7 @@ def trained(config, frozen, stages, guided, **weights):
         schedule, rollout = schedule_of(i, guided=guided, **weights), rollout_of(learner.ppo.actor, i)
         assert not rollout.valid.all()
         prior = frozen if guided else None
-        learner, _ = update(learner, prior, rollout, NORMALISER, schedule, jax.random.key(i), stages)
+        learner, _ = iterated(iterate, learner, prior, rollout, schedule, stages, config, i)
         history.append(learner.ppo)
     return history, learner.guide
 

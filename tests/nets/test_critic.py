@@ -7,11 +7,11 @@ from ppo_dap.nets.critic import Critic, QFunction, q_features
 
 OBSERVATIONS = jnp.asarray(np.random.default_rng(0).standard_normal((6, 3)), jnp.float32)
 ACTIONS = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (6, 4, 2)), jnp.float32)
-CRITIC = Critic.create(jax.random.key(0), 3, 8)
+CRITIC = Critic.create(np.random.default_rng(0), 3, 8)
 
 
 def create_q(own_trunk=False):
-    return QFunction.create(jax.random.key(1), 3, 2, 8, 5, own_trunk)
+    return QFunction.create(np.random.default_rng(1), 3, 2, 8, 5, own_trunk)
 
 
 def gradients(q, shared):
@@ -39,7 +39,7 @@ def test_qs_gradient_reaches_vs_trunk_only_when_shared(own_trunk, shared, reache
 
 
 def test_a_trunk_of_its_own_does_not_read_the_critics():
-    other = Critic.create(jax.random.key(7), 3, 8)
+    other = Critic.create(np.random.default_rng(7), 3, 8)
     for own_trunk in (True, False):
         q = create_q(own_trunk)
         features = [np.asarray(q_features(critic, q, OBSERVATIONS, True)) for critic in (CRITIC, other)]

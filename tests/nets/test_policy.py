@@ -17,7 +17,7 @@ CLIP = 2.0
 
 @pytest.fixture(scope="module")
 def actor():
-    actor = Actor.create(jax.random.key(0), 3, 2, 8)
+    actor = Actor.create(np.random.default_rng(0), 3, 2, 8)
     return jax.tree.map(
         lambda leaf: leaf + 0.2 * jnp.sin(jnp.arange(leaf.size, dtype=jnp.float32)).reshape(leaf.shape), actor
     )

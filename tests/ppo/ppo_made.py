@@ -7,7 +7,7 @@ import numpy as np
 
 from ppo_dap.config import PPOConfig
 from ppo_dap.nets.policy import Policy
-from ppo_dap.ppo.update import Normaliser, Rows
+from ppo_dap.ppo.update import Normaliser, Orders, Rows, draw_orders
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([3.0, 0.5], np.float32)
 TERMINATES, TRUNCATES, BOTH = (True, False), (False, True), (True, True)
@@ -63,7 +63,13 @@ def small_config(**changes):
 
 
 def no_normaliser(observation_size):
-    return Normaliser(jnp.zeros(observation_size), jnp.ones(observation_size), jnp.asarray(1.0))
+    return Normaliser(jnp.zeros(observation_size), jnp.ones(observation_size))
+
+
+def orders_of(ppo, seed=0, added=0):
+    """Orders of D_on's rows, and of `added` other ones."""
+    rng = np.random.default_rng(seed)
+    return Orders(*(draw_orders(rng, ppo.num_epochs, rows) for rows in (ppo.rollout_steps, added)))
 
 
 def make_rows(actor, count=64, seed=0):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppo.ppo_made import no_normaliser, small_config
+from ppo.ppo_made import no_normaliser, orders_of, small_config
 from ppo_dap.nets.policy import Policy
 from ppo_dap.ppo.rollout import Collector
 from ppo_dap.ppo.update import PPOState, Settings, estimate_advantages, improve_actor, improve_critic
@@ -48,19 +48,19 @@ class Probe:
 
 
 @functools.partial(jax.jit, static_argnames="ppo")
-def iteration(state, rollout, key, ppo=PPO):
-    rows = estimate_advantages(state.critic, rollout, no_normaliser(1), ppo)
+def iteration(state, parts, orders, ppo=PPO):
+    rows = estimate_advantages(state.critic, parts, no_normaliser(1), jnp.ones(()), ppo)
     rate = jnp.float32(1e-2)
     actor, actor_optimizer, metrics = improve_actor(
         state.actor,
         state.actor_optimizer,
         rows,
         (),
-        key,
+        orders,
         Settings(rate, jnp.float32(np.inf), jnp.array(False)),
         ppo=ppo,
     )
-    critic, critic_optimizer, _ = improve_critic(state.critic, state.critic_optimizer, rows, key, rate, ppo=ppo)
+    critic, critic_optimizer, _ = improve_critic(state.critic, state.critic_optimizer, rows, orders.rows, rate, ppo=ppo)
     return PPOState(actor, critic, actor_optimizer, critic_optimizer), metrics["ratio_error"]
 
 
@@ -71,11 +71,11 @@ def numpy_policy(actor):
 
 
 def train(probe, iterations):
-    state = PPOState.create(jax.random.key(0), 1, 1, PPO.hidden_size)
+    state = PPOState.create(np.random.default_rng(0), 1, 1, PPO.hidden_size)
     collector, rng = Collector(probe), np.random.default_rng(1)
     for i in range(iterations):
-        rollout = collector.collect(numpy_policy(state.actor), PPO.rollout_steps, i, rng)
-        state, ratio_error = iteration(state, rollout, jax.random.key(i))
+        parts = list(collector.collect(numpy_policy(state.actor), PPO.rollout_steps, 2, i, rng))
+        state, ratio_error = iteration(state, parts, orders_of(PPO, seed=i))
         assert float(ratio_error) < 1e-4
     return state
 

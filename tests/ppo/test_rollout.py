@@ -1,3 +1,4 @@
+import dataclasses
 from collections import Counter
 
 import jax
@@ -9,7 +10,7 @@ from scipy.stats import norm
 
 from ppo.ppo_made import BOTH, HIGH, LOW, TERMINATES, TRUNCATES, Scripted, make_policy, scripted_reward
 from ppo_dap.ppo.gae import gae
-from ppo_dap.ppo.rollout import Collector
+from ppo_dap.ppo.rollout import Collector, Rollout
 from ppo_dap.tasks.vector import Transition, wrap_gymnasium
 
 SCRIPTS = [
@@ -22,16 +23,18 @@ MODES = list(AutoresetMode)
 GAE = jax.jit(lambda *columns: gae(*columns, 0.9, 0.8))
 
 
-def collect(mode, rollouts=2, steps=80, first_iteration=0, wrap=lambda env: env):
+def collect(mode, rollouts=2, steps=80, first_iteration=0, wrap=lambda env: env, parts=4):
+    """Environments, collector, and the parts of all rollouts in a row."""
     scripted = [Scripted(script) for script in SCRIPTS]
     vector = SyncVectorEnv([lambda env=env: env for env in scripted], autoreset_mode=mode)
     collector = Collector(wrap(wrap_gymnasium(vector, seed=0)))
     rng, policy = np.random.default_rng(0), make_policy()
-    return scripted, collector, [collector.collect(policy, steps, first_iteration + i, rng) for i in range(rollouts)]
+    collected = [collector.collect(policy, steps, parts, first_iteration + i, rng) for i in range(rollouts)]
+    return scripted, collector, [part for rollout in collected for part in rollout]
 
 
 def columns(rollouts, *names):
-    """Both rollouts end to end, an array (time, envs, ...) for each name."""
+    """All parts end to end, an array (time, envs, ...) for each name."""
     return [np.concatenate([np.asarray(getattr(r, name)) for r in rollouts]) for name in names]
 
 
@@ -168,3 +171,26 @@ def test_the_same_generator_gives_the_same_rollout():
     first, again = (columns(collect(AutoresetMode.SAME_STEP)[2], "actions", "log_probs") for _ in range(2))
     np.testing.assert_array_equal(first[0], again[0])
     np.testing.assert_array_equal(first[1], again[1])
+
+
+@pytest.mark.parametrize("parts", [2, 5])
+def test_parts_end_to_end_are_the_rollout_in_one(parts):
+    names = [field.name for field in dataclasses.fields(Rollout)]
+    _, whole_collector, whole = collect(AutoresetMode.NEXT_STEP, parts=1)
+    _, collector, rollouts = collect(AutoresetMode.NEXT_STEP, parts=parts)
+    assert [len(r.rewards) for r in rollouts] == [20 // parts] * (2 * parts)
+    for name, joined, one in zip(names, columns(rollouts, *names), columns(whole, *names), strict=True):
+        np.testing.assert_array_equal(joined, one, err_msg=name)
+    assert collector.finished_returns == whole_collector.finished_returns
+
+
+def test_a_part_comes_before_the_next_is_stepped_and_stays_as_it_is():
+    env = Scripted(SCRIPTS[0])
+    vector = SyncVectorEnv([lambda: env], autoreset_mode=AutoresetMode.SAME_STEP)
+    rollout = Collector(wrap_gymnasium(vector, seed=0)).collect(make_policy(), 20, 4, 0, np.random.default_rng(0))
+    seen = []
+    for number, part in enumerate(rollout, 1):
+        assert len(env.actions) == 5 * number
+        seen.append((part, jax.tree.map(np.copy, part)))
+    for part, copy in seen:
+        jax.tree.map(np.testing.assert_array_equal, part, copy)

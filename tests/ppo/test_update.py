@@ -6,12 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ppo.ppo_made import make_rows, no_normaliser, small_config
+from ppo.ppo_made import make_rows, no_normaliser, orders_of, small_config
+from ppo_dap.ppo.gae import gae
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import (
     ADAM,
+    Normaliser,
     PPOState,
     Settings,
+    draw_orders,
     estimate_advantages,
     improve_actor,
     improve_critic,
@@ -20,8 +23,8 @@ from ppo_dap.ppo.update import (
 
 PPO = small_config()
 MINIBATCHES = PPO.rollout_steps // PPO.minibatch_size
-STATE = PPOState.create(jax.random.key(0), 3, 2, PPO.hidden_size)
-KEY = jax.random.key(1)
+STATE = PPOState.create(np.random.default_rng(0), 3, 2, PPO.hidden_size)
+ORDERS = orders_of(PPO, seed=1)
 LIMITLESS = Settings(jnp.float32(3e-3), jnp.float32(np.inf), jnp.array(False))
 RATE = jnp.float32(1e-3)
 ROWS = make_rows(STATE.actor)
@@ -35,8 +38,8 @@ def actor_program(added_gradient=None):
     return jax.jit(functools.partial(improve_actor, ppo=PPO, added_gradient=added_gradient))
 
 
-def improve(rows=ROWS, settings=LIMITLESS, key=KEY, added=(), added_gradient=None, actor=STATE.actor):
-    return actor_program(added_gradient)(actor, STATE.actor_optimizer, rows, added, key, settings)
+def improve(rows=ROWS, settings=LIMITLESS, orders=ORDERS, added=(), added_gradient=None, actor=STATE.actor):
+    return actor_program(added_gradient)(actor, STATE.actor_optimizer, rows, added, orders, settings)
 
 
 def limited(kl_limit):
@@ -66,7 +69,7 @@ def test_the_ratio_is_1_at_the_first_minibatch_of_fresh_rows():
 
 
 def test_an_older_policys_batch_makes_the_ratio_error_large():
-    older = PPOState.create(jax.random.key(9), 3, 2, PPO.hidden_size).actor
+    older = PPOState.create(np.random.default_rng(9), 3, 2, PPO.hidden_size).actor
     stale = make_rows(eqx.tree_at(lambda a: a.log_std, older, older.log_std - 0.2))
     assert float(improve(stale)[2]["ratio_error"]) > 0.05
 
@@ -91,7 +94,28 @@ def test_the_kl_rule_stops_after_the_first_epoch_over_the_limit():
 
 def test_same_seed_same_bits_and_another_seed_others():
     assert_same_bits(improve(), improve())
-    assert differ(improve()[0], improve(key=jax.random.key(2))[0])
+    assert differ(improve()[0], improve(orders=orders_of(PPO, seed=2))[0])
+
+
+def test_an_order_holds_each_row_once_and_epochs_have_their_own():
+    orders = draw_orders(np.random.default_rng(0), 50, 6)
+    assert orders.dtype == np.int32
+    np.testing.assert_array_equal(np.sort(orders, axis=1), np.broadcast_to(np.arange(6), (50, 6)))
+    assert len({*map(tuple, orders.tolist())}) > 40
+    firsts = np.bincount(draw_orders(np.random.default_rng(1), 6000, 6)[:, 0], minlength=6)
+    assert np.abs(firsts - 1000).max() < 5 * np.sqrt(1000 * 5 / 6)
+
+
+def test_minibatches_are_cut_from_an_epochs_order():
+    """Other places within a minibatch change the rounding at most, another minibatch changes what is learned."""
+    shape = (PPO.num_epochs, MINIBATCHES, PPO.minibatch_size)
+    within = ORDERS.rows.reshape(shape)[..., ::-1].reshape(ORDERS.rows.shape)
+    start, same, other = (
+        np.asarray(improve(orders=ORDERS._replace(rows=rows))[0].log_std)
+        for rows in (ORDERS.rows, within, ORDERS.rows[:, ::-1])
+    )
+    np.testing.assert_allclose(same, start, atol=1e-5)
+    assert np.abs(other - start).max() > 1e-4
 
 
 def test_advantages_move_the_policy_towards_the_better_actions():
@@ -133,7 +157,8 @@ def pull(actor, added, weight):
 
 def pulled(weight, adds=True):
     settings = LIMITLESS._replace(adds=jnp.array(adds), added_weights=jnp.float32(weight))
-    return improve(settings=settings, added=jnp.full((8, 3), 5.0), added_gradient=pull)
+    orders = orders_of(PPO, seed=1, added=8)
+    return improve(settings=settings, orders=orders, added=jnp.full((8, 3), 5.0), added_gradient=pull)
 
 
 def test_an_added_gradient_of_zeros_leaves_every_bit():
@@ -161,7 +186,7 @@ def test_the_critic_fits_a_known_function():
     critic, optimizer = STATE.critic, STATE.critic_optimizer
     losses = []
     for i in range(60):
-        critic, optimizer, metrics = CRITIC(critic, optimizer, rows, jax.random.key(i), jnp.float32(5e-3))
+        critic, optimizer, metrics = CRITIC(critic, optimizer, rows, orders_of(PPO, seed=i).rows, jnp.float32(5e-3))
         losses.append(float(metrics["value_loss"]))
     errors = np.asarray(critic(rows.observations)) - np.sin(np.asarray(rows.observations[:, 0]))
     assert (errors**2).mean() < 0.02
@@ -189,9 +214,30 @@ def random_rollout(seed=0, masked=True):
     )
 
 
+def parts_of(rollout, lengths=(4, 10, 2)):
+    """The rollout as parts that follow each other in time."""
+    ends = np.cumsum(lengths)
+    return [jax.tree.map(lambda x, a=a, b=b: x[a:b], rollout) for a, b in zip(ends - lengths, ends, strict=True)]
+
+
+def test_advantages_run_on_from_part_to_part():
+    rollout = random_rollout()
+    rows = ADVANTAGES(STATE.critic, parts_of(rollout), no_normaliser(3), jnp.ones(()))
+    values, successors = (VALUES(STATE.critic, o) for o in (rollout.observations, rollout.next_observations))
+    flags = rollout.terminated, rollout.truncated, rollout.valid
+    columns = rollout.rewards, values, successors, *flags
+    whole = np.asarray(gae(*columns, PPO.gamma, PPO.gae_lambda))
+    np.testing.assert_allclose(rows.advantages, whole.ravel(), rtol=1e-4, atol=1e-5)
+    # Each part on its own gives other advantages where an episode goes on.
+    alone = [gae(*part, PPO.gamma, PPO.gae_lambda) for part in parts_of(columns)]
+    last = np.asarray(~rollout.terminated & ~rollout.truncated & rollout.valid)[3]
+    assert last.any()
+    assert np.all(np.abs(np.concatenate(alone) - whole)[3, last] > 0.01)
+
+
 def test_targets_are_flattened_in_step_with_their_rows():
     rollout = random_rollout()
-    rows = ADVANTAGES(STATE.critic, rollout, no_normaliser(3)._replace(reward_std=jnp.float32(2.0)))
+    rows = ADVANTAGES(STATE.critic, parts_of(rollout), no_normaliser(3), jnp.float32(2.0))
     values, successors = (VALUES(STATE.critic, o) for o in (rollout.observations, rollout.next_observations))
     got, sent = (jax.tree.map(np.asarray, x) for x in (rows, rollout))
     for kind in (sent.terminated, sent.truncated, ~sent.valid, sent.valid):
@@ -215,8 +261,8 @@ def test_observations_and_rewards_are_normalised_and_clipped():
         observations=rollout.observations.at[0, 0].set(1e6),
         terminated=jnp.ones_like(rollout.terminated),
     )
-    normaliser = no_normaliser(3)._replace(mean=jnp.full(3, 0.5), std=jnp.full(3, 2.0), reward_std=jnp.float32(4.0))
-    rows = ADVANTAGES(STATE.critic, rollout, normaliser)
+    normaliser = Normaliser(jnp.full(3, 0.5), jnp.full(3, 2.0))
+    rows = ADVANTAGES(STATE.critic, parts_of(rollout), normaliser, jnp.float32(4.0))
     expected = np.clip((np.asarray(rollout.observations).reshape(64, 3) - 0.5) / 2, -10, 10)
     np.testing.assert_allclose(rows.observations, expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(rows.q_targets, np.minimum(np.asarray(rollout.rewards).ravel() / 4, 10), rtol=1e-5)
@@ -241,7 +287,10 @@ def test_masked_rows_of_a_rollout_reach_no_other_row():
     masked = ~np.asarray(rollout.valid)
     assert masked.sum() > 5
     names = ("observations", "next_observations", "rewards", "actions", "means", "log_probs")
-    program = functools.partial(ADVANTAGES, STATE.critic, normaliser=no_normaliser(3))
+
+    def program(rollout):
+        return ADVANTAGES(STATE.critic, parts_of(rollout), no_normaliser(3), jnp.ones(()))
+
     rows, garbled = program(rollout), program(garble(rollout, masked, names))
     kept = ~masked.ravel()
     assert_same_bits(*(jax.tree.map(lambda x: x[kept], r) for r in (rows, garbled)))
@@ -259,9 +308,9 @@ def test_masked_rows_move_neither_actor_nor_critic_nor_metrics(name):
     garbled = garble(half, MASKED, [name])
     assert_same_bits(improve(garbled), improve(half))
     critic = (STATE.critic, STATE.critic_optimizer)
-    assert_same_bits(CRITIC(*critic, garbled, KEY, RATE), CRITIC(*critic, half, KEY, RATE))
-    every = improve(garble(ROWS, MASKED, [name])), CRITIC(*critic, garble(ROWS, MASKED, [name]), KEY, RATE)
-    assert differ(every, (improve(), CRITIC(*critic, ROWS, KEY, RATE)))  # with weight 1 the same garbage counts
+    assert_same_bits(CRITIC(*critic, garbled, ORDERS.rows, RATE), CRITIC(*critic, half, ORDERS.rows, RATE))
+    every = improve(garble(ROWS, MASKED, [name])), CRITIC(*critic, garble(ROWS, MASKED, [name]), ORDERS.rows, RATE)
+    assert differ(every, (improve(), CRITIC(*critic, ROWS, ORDERS.rows, RATE)))  # with weight 1 the same garbage counts
 
 
 def test_a_masked_row_whose_ratio_overflows_does_no_harm():

@@ -1,7 +1,6 @@
 import sys
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -48,5 +47,5 @@ def labelled():
     rows = Rows(*(jnp.asarray(a, jnp.float32) for a in (rng.standard_normal((8000, 2)), label, actions)))
     config = DiffusionConfig(**{**SMALL, "width": 32, "max_steps": 600, "chunk_steps": 200}, num_conditions=1)
     held_out = Rows(*(a[7000:] for a in rows))
-    denoiser, _ = train_denoiser(Rows(*(a[:7000] for a in rows)), held_out, config, jax.random.key(0))
+    denoiser, _ = train_denoiser(Rows(*(a[:7000] for a in rows)), held_out, config, 0)
     return denoiser, config

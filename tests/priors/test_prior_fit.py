@@ -1,4 +1,5 @@
 import dataclasses
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -66,9 +67,9 @@ def scripted(monkeypatch, losses):
     """Let the held-out loss follow a script; the averaged weights carry the number of their look."""
     calls = []
 
-    def chunk(state, train, held_out, train_key, validation_key, config):
+    def chunk(state, train, held_out, picks, draws, held_out_draws, config):
         look = len(calls)
-        calls.append((held_out, validation_key))
+        calls.append((held_out, held_out_draws, picks, draws))
         marked = fit.Denoiser(**{**vars(state.ema), "sigma_data": jnp.asarray(float(look))})
         state = state._replace(ema=marked, step=state.step + config.chunk_steps)
         return state, (jnp.asarray(1.0), jnp.asarray(losses[look]))
@@ -76,16 +77,19 @@ def scripted(monkeypatch, losses):
     monkeypatch.setattr(fit, "train_chunk", chunk)
     rows = Rows(jnp.ones((40, 1)), jnp.zeros((40, 0)), jnp.ones((40, 1)))
     config = DiffusionConfig(**{**QUICK, "max_steps": 80, "patience": 3})
-    return train_denoiser(rows, rows, config, jax.random.key(0)), calls
+    return train_denoiser(rows, rows, config, 0), calls
 
 
 def test_early_stopping_keeps_the_best(monkeypatch):
     (denoiser, summary), calls = scripted(monkeypatch, [3.0, 2.0, 1.0, 1.5, 1.0, 1.2, 0.1, 0.1])
     assert float(denoiser.sigma_data) == 2  # the third look
     assert (summary["best_step"], summary["steps"], summary["validation_loss"]) == (30, 60, 1.0)
-    for held_out, key in calls:  # the same rows and the same noise at every look
+    for held_out, held_out_draws, *_ in calls:  # the same rows and the same noise at every look
         assert held_out is calls[0][0]
-        assert key is calls[0][1]
+        assert held_out_draws is calls[0][1]
+    for one, two in pairwise(calls):  # the steps between two looks have rows and noise of their own
+        assert all(np.all(a != b) for a, b in zip(one[3], two[3], strict=True))
+        assert np.mean(one[2] != two[2]) > 0.9
 
 
 def test_a_fit_that_diverges_says_when(monkeypatch):

@@ -1,4 +1,4 @@
-from functools import partial
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from truths import TwoModes, energy, moment_matched, two_sample_p
 
 from ppo_dap.errors import InputError
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-from ppo_dap.priors.samplers import SAMPLERS, ancestral, centred_start, dpmpp_2m, karras_sigmas, sample_actions
+from ppo_dap.priors.samplers import SAMPLERS, Solver, ancestral, centred_start, dpmpp_2m, karras_sigmas, sample_actions
 
 STATE = np.array([[0.3, -0.6]])
 CONFIG = DiffusionConfig(width=16, depth=1)
@@ -30,9 +30,10 @@ def exact_samples(sampler, steps, num, seed=0):
     return np.asarray(run(noise)[0], np.float64)
 
 
-def small_denoiser(observation_size=3, action_size=2):
+def small_denoiser(observation_size=3, action_size=2, depth=1):
     moments = jnp.zeros(observation_size), jnp.ones(observation_size), jnp.asarray(0.5)
-    return Denoiser.create(jax.random.key(0), CONFIG, *moments, action_size)
+    config = dataclasses.replace(CONFIG, depth=depth)
+    return Denoiser.create(np.random.default_rng(0), config, *moments, action_size)
 
 
 def test_karras_sigmas_end_points_and_spacing():
@@ -180,36 +181,48 @@ def walk(jaxpr, inside=False):
                 yield from walk(inner, inside or equation.primitive.name in ("scan", "while"))
 
 
+def random_draws(program):
+    return [e for e, _ in walk(program.jaxpr) if e.primitive.name.startswith(("random", "threefry"))]
+
+
 @pytest.mark.parametrize("sampler", ["ancestral", "dpmpp_2m"])
-def test_states_are_embedded_once_and_noise_drawn_once(sampler):
-    denoiser = small_denoiser(observation_size=13)
-    arguments = jnp.zeros((7, 13)), jnp.zeros((7, 0)), jax.random.key(0)
+@pytest.mark.parametrize("depth", [1, 2])
+def test_states_are_embedded_once_and_nothing_is_drawn(sampler, depth):
+    denoiser, solver = small_denoiser(13, depth=depth), Solver(sampler, 5)
+    arguments = jnp.zeros((7, 13)), jnp.zeros((7, 0)), jnp.zeros(solver.noise_shape(7, 6, 2))
 
-    def run(observations, condition, key):
-        return sample_actions(denoiser, None, observations, condition, key, 5, CONFIG, sampler=sampler)
+    def run(observations, condition, noise):
+        return sample_actions(denoiser, None, observations, condition, noise, solver, CONFIG)
 
-    equations = list(walk(jax.make_jaxpr(run)(*arguments).jaxpr))
-    products = [(e, loop) for e, loop in equations if e.primitive.name == "dot_general"]
-    of_states = [loop for e, loop in products if e.invars[0].aval.shape[0] == 7 and e.invars[0].aval.ndim == 2]
-    assert of_states == [False, False]  # the two layers of the state network, outside the loop
-    of_actions = [loop for e, loop in products if e.invars[0].aval.ndim == 3]
-    once = 4 * (sampler == "dpmpp_2m")  # a call has four products; this solver calls once before its loop
-    assert of_actions.count(False) == once
-    assert of_actions.count(True) == 4
-    draws = [loop for e, loop in equations if e.primitive.name == "random_bits"]
-    assert draws == [False]
+    program = jax.make_jaxpr(run)(*arguments)
+    products = [(e.invars[0].aval.shape, loop) for e, loop in walk(program.jaxpr) if e.primitive.name == "dot_general"]
+    of_states = [loop for shape, loop in products if len(shape) == 2]
+    assert of_states == [False] * 3  # the three layers of the state network, outside the loop
+    # A call has a product for each layer that sees the actions and one for the noise level, one row for all of them.
+    # The deterministic solver calls once before its loop.
+    for shape, count in (((7, 6), 2 + depth), ((1, 1), 1)):
+        loops = [loop for found, loop in products if len(found) == 3 and found[:2] == shape]
+        assert loops.count(False) == count * (sampler == "dpmpp_2m")
+        assert loops.count(True) == count
+    assert len(products) == 3 + (3 + depth) * (1 + (sampler == "dpmpp_2m"))
+    assert random_draws(program) == []
+    assert random_draws(jax.make_jaxpr(jax.random.normal)(jax.random.key(0)))  # planted
 
 
-def test_sample_actions_repeats_under_the_same_key_only():
+def test_sample_actions_repeats_under_the_same_noise_only():
     denoiser = small_denoiser()
     observations, condition = jnp.ones((4, 3)), jnp.zeros((4, 0))
+    sample = jax.jit(sample_actions, static_argnums=(5, 6))
 
-    @partial(jax.jit, static_argnames=("sampler", "num_steps"))
-    def run(seed, **options):
-        return sample_actions(denoiser, None, observations, condition, jax.random.key(seed), 6, CONFIG, **options)[0]
+    def run(seed, sampler="ancestral", num_steps=20):
+        solver = Solver(sampler, num_steps)
+        noise = jax.random.normal(jax.random.key(seed), solver.noise_shape(4, 6, 2))
+        return sample(denoiser, None, observations, condition, noise, solver, CONFIG)[0]
 
     np.testing.assert_array_equal(run(0), run(0))
     assert np.abs(np.asarray(run(0) - run(1))).max() > 0.01
     assert run(0, sampler="dpmpp_2m", num_steps=3).shape == (4, 6, 2)
+    assert Solver("ancestral", 3).noise_shape(4, 6, 2) == (4, 4, 6, 2)  # the start and one for each step
+    assert Solver("dpmpp_2m", 3).noise_shape(4, 6, 2) == (1, 4, 6, 2)
     with pytest.raises(InputError, match="did you mean 'ancestral'"):
         run(0, sampler="ancestrel")

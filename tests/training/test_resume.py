@@ -16,6 +16,7 @@ from safetensors.numpy import load_file
 import ppo_dap
 from ppo_dap.errors import TrainingDiverged
 from ppo_dap.training import trainer
+from ppo_dap.training.clock import DEVICE, HOST
 
 TIMING = ("seconds_", "steps_per_second")
 
@@ -63,8 +64,9 @@ def uninterrupted(tmp_path_factory, hopper_prior, small):
 def test_kill_and_resume_equals_an_uninterrupted_run(tmp_path, hopper_prior, small, uninterrupted):
     out = tmp_path / "run"
     process = subprocess.Popen(command(hopper_prior, out, small))
-    # 5 lines are past the first checkpoint and before the second, and the kill falls anywhere within an iteration.
-    wait_for_lines(out, 5)
+    # 4 lines are past the first checkpoint and before the second, and the kill falls anywhere within an iteration. (A
+    # line is written in the next iteration, if no evaluation comes before.)
+    wait_for_lines(out, 4)
     time.sleep(float(np.random.default_rng().uniform(0, 0.05)))
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -87,6 +89,19 @@ def test_interrupt_ends_with_a_checkpoint_and_says_how_to_go_on(tmp_path, hopper
     assert not run.finished
     header = (out / "checkpoints" / "last.safetensors").read_bytes()
     assert f'\\"iteration\\": {run.metrics[-1]["iteration"]}'.encode() in header
+
+
+def test_every_iteration_says_where_its_time_went(uninterrupted):
+    metrics = ppo_dap.load_run(uninterrupted).metrics
+    names = {f"seconds_{name}" for name in (*HOST, *DEVICE)}
+    for row in metrics:
+        assert {name for name in row if name.startswith("seconds_")} == names | {"seconds_iteration"}
+        assert min(row[name] for name in names) >= 0
+        assert 0 < sum(row[f"seconds_{name}"] for name in HOST) <= row["seconds_iteration"]
+    steps = np.diff([0, *(row["env_steps"] for row in metrics)])
+    speeds = [row["steps_per_second"] * row["seconds_iteration"] for row in metrics]
+    np.testing.assert_allclose(speeds, steps)
+    assert [row["iteration"] for row in metrics] == list(range(1, len(metrics) + 1))
 
 
 def test_another_config_cannot_resume_a_run(uninterrupted, hopper_prior, small):
@@ -136,14 +151,14 @@ def test_a_removed_checkpoint_folder_is_made_again(tmp_path, monkeypatch, small,
 
 
 def test_a_diverging_run_stops_and_names_iteration_loss_and_checkpoint(tmp_path, monkeypatch, small):
-    original = trainer.update
+    original = trainer.iterate
 
-    def poisoned(learner, frozen, rollout, normaliser, schedule, *rest):
-        new, metrics = original(learner, frozen, rollout, normaliser, schedule, *rest)
+    def poisoned(learner, frozen, rollout, normaliser, reward_std, schedule, *rest):
+        new, metrics = original(learner, frozen, rollout, normaliser, reward_std, schedule, *rest)
         first = int(schedule.first_id) // small["rollout_steps"]
         return new, metrics | ({"value_loss": np.nan} if first == 4 else {})
 
-    monkeypatch.setattr(trainer, "update", poisoned)
+    monkeypatch.setattr(trainer, "iterate", poisoned)
     out = tmp_path / "run"
     with pytest.raises(TrainingDiverged, match=r"iteration 4: value_loss is nan.*checkpoint is .*last\.safetensors"):
         ppo_dap.train("Hopper-v5", "ppo", out=out, steps=1500, progress=False, **small)

@@ -1,4 +1,3 @@
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ def made_logs(rewards=True):
 
 
 def start(config):
-    learner = create_learner(jax.random.key(0), (2, 1), config, None)
+    learner = create_learner((2, 1), config, None)
     return TrainState(learner, RunningMoments.create(2), RewardScale.create(config.ppo.num_envs))
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import AdaptationConfig
 from ppo_dap.nets.adapters import Adapters
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, denoising_loss
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, LossDraws, denoising_loss
 
 Provenance = Callable[[Int[Array, " n"], Float[Array, "n obs"]], Float[Array, " n"]]
 """(state_ids, raw states) -> 1 for each that is a row of D_on, else 0."""
@@ -31,6 +32,21 @@ class PETData(eqx.Module):
     weights: Float[Array, " rows"]
 
 
+class PETDraws(NamedTuple):
+    """The random numbers of as many PET steps as an iteration can have; those that are not due go unused."""
+
+    rows: Float[Array, "steps batch"]
+    """Uniform; which rows each step sees."""
+    loss: LossDraws
+
+    @staticmethod
+    def make(rng: np.random.Generator, action_size: int, actor_updates: int, config: AdaptationConfig):
+        """Draws for an iteration of `actor_updates`."""
+        most = max(1, -(-config.pet_frequency * actor_updates // 100))  # a loop of no steps is traced all the same
+        size = (most, config.pet_minibatch_size)
+        return PETDraws(rng.random(size, dtype=np.float32), LossDraws.make(rng, *size, action_size))  # type: ignore[arg-type]
+
+
 def steps_until(iteration: int, pet_frequency: int, actor_updates: int) -> int:
     """PET steps due in all of the first `iteration` iterations: f for every 100 actor updates, rounded down."""
     return iteration * pet_frequency * actor_updates // 100
@@ -41,7 +57,7 @@ def adapt(
     adapters: Adapters,
     optimizer: optax.OptState,
     rows: PETData,
-    key: PRNGKeyArray,
+    draws: PETDraws,
     num_steps: Int[Array, ""],
     *,
     diffusion: DiffusionConfig,
@@ -59,12 +75,11 @@ def adapt(
 
     def step(i, carry):
         adapters, optimizer, total, spr = carry
-        draw_key, loss_key = jax.random.split(jax.random.fold_in(key, i))
-        uniform = jax.random.uniform(draw_key, (config.pet_minibatch_size,))
+        uniform, noise = jax.tree.map(lambda x: x[i], draws)
         index = order[jnp.floor(uniform * num_valid).astype(jnp.int32)]
         batch = jax.tree.map(lambda x: x[index], rows)
         loss, gradient = jax.value_and_grad(
-            lambda a: denoising_loss(denoiser, a, batch.observations, condition, batch.actions, loss_key, diffusion)
+            lambda a: denoising_loss(denoiser, a, batch.observations, condition, batch.actions, noise, diffusion)
         )(adapters)
         updates, optimizer = ADAM.update(gradient, optimizer)
         adapters = jax.tree.map(lambda p, u: p - config.pet_learning_rate * u, adapters, updates)

@@ -13,12 +13,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from ppo_dap.config import PPOConfig, ProposalConfig
 from ppo_dap.dap.dataflow import Flow
 from ppo_dap.dap.objective import Batch, GatedProposals, Weights, admit, admit_proposals, proposal_terms
-from ppo_dap.dap.proposals import Proposals, gaussian_proxy
+from ppo_dap.dap.proposals import Proposals, gaussian_proxy, solver
 from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
 from ppo_dap.nets.adapters import Adapters
 from ppo_dap.ppo.surrogate import weighted_mean
@@ -27,7 +27,7 @@ from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 from ppo_dap.priors.samplers import sample_actions
 
 DELTA = 1e-8
-PROXY_STATES = 32
+PROXY_STATES = 16
 """States on which the prior is sampled again for prior-KL and the KL to the frozen prior."""
 RATIO_TOLERANCE = 1e-3
 """Largest |ratio - 1| at the first minibatch: rollout (numpy) and update (XLA) round differently, no more."""
@@ -108,7 +108,7 @@ def prior_metrics(
     before: Adapters,
     after: Adapters,
     proposals: Proposals,
-    key: PRNGKeyArray,
+    noise: Float[Array, "draws few k act"],
     *,
     diffusion: DiffusionConfig,
     config: ProposalConfig,
@@ -118,7 +118,9 @@ def prior_metrics(
     The prior is sampled with the same noise before and after PET and frozen, so that "small prior-KL" is not noise and
     "nothing moved" shows.
     """
-    few = jax.tree.map(lambda x: x[:PROXY_STATES], proposals)
+    # Spread over the whole rollout: the proposals come in the order of its parts.
+    step = max(1, proposals.actions.shape[0] // noise.shape[1])
+    few = jax.tree.map(lambda x: x[::step][: noise.shape[1]], proposals)
     condition = jnp.zeros((few.observations.shape[0], diffusion.num_conditions))
 
     def proxy(adapters: Adapters | None):
@@ -127,11 +129,9 @@ def prior_metrics(
             adapters,
             few.raw_observations,
             condition,
-            key,
-            config.num_proposals,
+            noise,
+            solver(config),
             diffusion,
-            sampler=config.sampler,
-            num_steps=config.sampler_steps,
         )
         mean, std = gaussian_proxy(actions, config.proxy_std_floor)
         return mean, jnp.log(std)

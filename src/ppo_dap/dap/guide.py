@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import Config
 from ppo_dap.dap import adaptation, q_learning
 from ppo_dap.dap.objective import Batch, GatedProposals, admit_proposals, provenance
-from ppo_dap.dap.proposals import States, choose_states, propose
+from ppo_dap.dap.proposals import ProposalDraws, Proposals, States, choose_states, propose
 from ppo_dap.nets.adapters import Adapters, adapter_norm, init_adapters
 from ppo_dap.nets.critic import Critic, QFunction, q_features
 from ppo_dap.ppo.update import Rows
@@ -29,6 +33,28 @@ class GuideState(eqx.Module):
     q_spread: Float[Array, ""]
     adapters: Adapters
     pet_optimizer: optax.OptState
+
+
+class Visited(eqx.Module):
+    """States of D_on, or of a part of it, a row each: what proposals are made for."""
+
+    state_ids: Int[Array, " rows"]
+    raw_observations: Float[Array, "rows obs"]
+    """What the prior reads."""
+    observations: Float[Array, "rows obs"]
+    """What the policy and Q read (normalised)."""
+    weights: Float[Array, " rows"]
+    """1, or 0 for a row in which no transition happened."""
+
+
+class Proposed(eqx.Module):
+    """Proposals on a part of D_on, not yet admitted."""
+
+    proposals: Proposals
+    wanted: Int[Array, ""]
+    """How many of them are for rows in which a transition happened."""
+    q_spread: Float[Array, ""]
+    metrics: dict[str, Float[Array, ""]]
 
 
 class OnPolicy(eqx.Module):
@@ -52,50 +78,44 @@ def on_policy(rows: Rows) -> OnPolicy:
 
 
 def create_guide(
-    key: PRNGKeyArray, critic: Critic | None, sizes: tuple[int, int], config: Config, denoiser: Denoiser
+    rng: np.random.Generator, critic: Critic | None, sizes: tuple[int, int], config: Config, denoiser: Denoiser
 ) -> GuideState:
     """A fresh Q head and identity adapters for (observation, action) `sizes`; Q reads `critic`'s trunk."""
-    q_key, adapter_key = jax.random.split(key)
     own_trunk = config.q.q_trunk == "separate"
-    q = QFunction.create(q_key, *sizes, config.ppo.hidden_size, config.q.q_hidden_size, own_trunk)
-    adapters = init_adapters(adapter_key, denoiser, config.adaptation.adapter, config.adaptation.adapter_rank)
+    q = QFunction.create(rng, *sizes, config.ppo.hidden_size, config.q.q_hidden_size, own_trunk)
+    adapters = init_adapters(rng, denoiser, config.adaptation.adapter, config.adaptation.adapter_rank)
     return GuideState(
         q,
         q_learning.ADAM.init(q_learning.trainable(q, critic, config.q)),
-        jnp.ones(()),
+        jnp.asarray(np.float32(1)),
         adapters,
         adaptation.ADAM.init(adapters),
     )
 
 
-def num_proposal_states(num_rows: int, config: Config) -> int:
-    """States that get proposals: the same whole number for every minibatch of an epoch."""
-    num_minibatches = max(1, num_rows // config.ppo.minibatch_size)
-    return max(1, int(config.proposals.proposal_fraction * num_rows / num_minibatches)) * num_minibatches
+def num_proposal_states(num_rows: int, parts: int, config: Config) -> int:
+    """States that get proposals: the same whole number for every minibatch of an epoch, and for every part of D_on."""
+    unit = math.lcm(max(1, num_rows // config.ppo.minibatch_size), parts)
+    return max(1, int(config.proposals.proposal_fraction * num_rows / unit)) * unit
 
 
 def make_proposals(
     guide: GuideState,
     denoiser: Denoiser,
     critic: Critic | None,
-    rows: OnPolicy,
-    batch: Batch,
+    visited: Visited,
     beta: Float[Array, ""],
-    key: PRNGKeyArray,
+    draws: ProposalDraws,
     *,
     config: Config,
     diffusion: DiffusionConfig,
-) -> tuple[GatedProposals, Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Step 3: proposals on a random subset of D_on's states; also Q's new running scale, and metrics.
-
-    Among them `spr`, Eq. 12: the share of the proposals whose states come from the current on-policy batch.
-    """
-    choose_key, propose_key = jax.random.split(key)
-    index = choose_states(rows.weights, choose_key, num_proposal_states(rows.weights.shape[0], config))
-    observations = rows.observations[index]
+) -> Proposed:
+    """Step 3: proposals on a random subset of the visited states, as many as there are draws for."""
+    index = choose_states(visited.weights, draws.order, draws.resample.shape[0])
+    observations = visited.observations[index]
     states = States(
-        rows.state_ids[index],
-        rows.raw_observations[index],
+        visited.state_ids[index],
+        visited.raw_observations[index],
         observations,
         q_features(critic, guide.q, observations, shared=False),
     )
@@ -104,28 +124,40 @@ def make_proposals(
         guide.adapters,
         guide.q,
         states,
-        propose_key,
+        draws,
         beta,
         guide.q_spread,
         diffusion=diffusion,
         config=config.proposals,
     )
-    gated = admit_proposals(proposals, batch)
-    spread = Q_SPREAD_DECAY * guide.q_spread + (1 - Q_SPREAD_DECAY) * metrics.pop("q_spread")
     # Rows in which no transition happened fill up the subset when it wants more states than there are; the gate stops
     # them, and they are no proposals of another batch.
-    expected = jnp.sum(batch.weights[index] > 0)
-    return gated, spread, metrics | {"spr": jnp.sum(gated.gate) / jnp.maximum(expected, 1)}
+    return Proposed(proposals, jnp.sum(visited.weights[index] > 0), metrics.pop("q_spread"), metrics)
+
+
+def gate_proposals(
+    guide: GuideState, parts: Sequence[Proposed], batch: Batch
+) -> tuple[GatedProposals, Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """The proposals of all parts of D_on behind the provenance gate; also Q's new running scale, and metrics.
+
+    Among them `spr`, Eq. 12: the share of the proposals whose states come from the current on-policy batch.
+    """
+    gated = admit_proposals(jax.tree.map(lambda *x: jnp.concatenate(x), *(part.proposals for part in parts)), batch)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *(part.metrics for part in parts))
+    spread = jnp.sqrt(jnp.mean(jnp.stack([jnp.square(part.q_spread) for part in parts])))
+    metrics = {name: jnp.mean(values) for name, values in stacked.items()}
+    metrics["spr"] = jnp.sum(gated.gate) / jnp.maximum(sum(part.wanted for part in parts), 1)
+    return gated, Q_SPREAD_DECAY * guide.q_spread + (1 - Q_SPREAD_DECAY) * spread, metrics
 
 
 def learn_q(
-    guide: GuideState, critic: Critic | None, rows: OnPolicy, key: PRNGKeyArray, *, config: Config
+    guide: GuideState, critic: Critic | None, rows: OnPolicy, orders: Int[Array, "epochs rows"], *, config: Config
 ) -> tuple[QFunction, Critic | None, optax.OptState, dict[str, Float[Array, ""]]]:
     """Step 4, Q's part: one-step TD on the actions that were executed (clipped to the box)."""
     data = q_learning.QData(rows.observations, rows.actions, rows.q_targets, rows.weights)
     size = min(config.ppo.minibatch_size, rows.weights.shape[0])
     q, critic, optimizer, loss = q_learning.fit_q(
-        guide.q, critic, guide.q_optimizer, data, key, minibatch_size=size, config=config.q
+        guide.q, critic, guide.q_optimizer, data, orders, minibatch_size=size, config=config.q
     )
     return q, critic, optimizer, {"q_loss": loss}
 
@@ -136,7 +168,7 @@ def adapt_prior(
     rows: OnPolicy,
     batch: Batch,
     num_steps: Int[Array, ""],
-    key: PRNGKeyArray,
+    draws: adaptation.PETDraws,
     *,
     config: Config,
     diffusion: DiffusionConfig,
@@ -148,7 +180,7 @@ def adapt_prior(
         guide.adapters,
         guide.pet_optimizer,
         data,
-        key,
+        draws,
         num_steps,
         diffusion=diffusion,
         config=config.adaptation,

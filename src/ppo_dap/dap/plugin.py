@@ -11,14 +11,25 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from ppo_dap import config as configs
-from ppo_dap.dap.adaptation import steps_until
+from ppo_dap.dap.adaptation import PETDraws, steps_until
 from ppo_dap.dap.guidance import beta_schedule
-from ppo_dap.dap.guide import GuideState, OnPolicy, adapt_prior, create_guide, learn_q, make_proposals
+from ppo_dap.dap.guide import (
+    GuideState,
+    OnPolicy,
+    Visited,
+    adapt_prior,
+    create_guide,
+    gate_proposals,
+    learn_q,
+    make_proposals,
+    num_proposal_states,
+)
 from ppo_dap.dap.objective import Batch
-from ppo_dap.dap.proposals import Proposals
+from ppo_dap.dap.proposals import ProposalDraws, Proposals
 from ppo_dap.errors import InputError
 from ppo_dap.nets.normalizer import RunningMoments
 from ppo_dap.nets.policy import scale_actions
+from ppo_dap.ppo.update import draw_orders
 from ppo_dap.priors import DiffusionPrior
 
 
@@ -42,11 +53,11 @@ class Guide:
         self.prior, self.iteration, self._total = prior, 0, total_iterations
         self._moments = RunningMoments.create(prior.observation_size)
         self._rewards = RunningMoments.create(1)
-        key = jax.random.key(self.config.run.seed)
-        self._key, guide_key = jax.random.split(key)
+        rng = np.random.default_rng(self.config.run.seed)
         sizes = (prior.observation_size, prior.action_size)
-        self._state = create_guide(guide_key, None, sizes, self.config, prior.denoiser)
+        self._state = create_guide(rng, None, sizes, self.config, prior.denoiser)
         self._propose = jax.jit(partial(make_proposals, config=self.config, diffusion=prior.config))
+        self._gate = jax.jit(gate_proposals)
         self._learn_q = jax.jit(partial(learn_q, config=self.config))
         self._adapt = jax.jit(partial(adapt_prior, config=self.config, diffusion=prior.config))
         self.metrics: dict[str, float] = {}
@@ -73,22 +84,25 @@ class Guide:
         rows, batch = self._rows(observations, actions, rewards, next_values, terminated, valid)
         progress = self.iteration / self._total
         updates = self.config.ppo.num_epochs * len(rows.weights) // self.config.ppo.minibatch_size
-        keys = jax.random.split(jax.random.fold_in(self._key, self.iteration), 3)
+        rng = np.random.default_rng([self.config.run.seed, self.iteration])
+        n, act, proposals = len(rows.weights), self.prior.action_size, self.config.proposals
         beta = beta_schedule(progress, self.config.proposals.beta_max, self.config.proposals.beta_anneal)
         denoiser, state = self.prior.denoiser, self._state
-        gated, spread, proposed = self._propose(
-            state, denoiser, None, rows, batch, jnp.asarray(beta, jnp.float32), keys[0]
-        )
-        q, _, q_optimizer, learned = self._learn_q(state, None, rows, keys[1])
+        draws = ProposalDraws.make(rng, n, num_proposal_states(n, 1, self.config), act, proposals)
+        visited = Visited(rows.state_ids, rows.raw_observations, rows.observations, rows.weights)
+        proposed = self._propose(state, denoiser, None, visited, jnp.asarray(beta, jnp.float32), draws)
+        gated, spread, of_proposals = self._gate(state, [proposed], batch)
+        q, _, q_optimizer, learned = self._learn_q(state, None, rows, draw_orders(rng, self.config.q.q_epochs, n))
         frequency = self.config.adaptation.pet_frequency
         due = [steps_until(i, frequency, updates) for i in (self.iteration, self.iteration + 1)]
+        pet = PETDraws.make(rng, act, updates, self.config.adaptation)
         adapters, optimizer, adapted = self._adapt(
-            state, denoiser, rows, batch, jnp.asarray(due[1] - due[0], jnp.int32), keys[2]
+            state, denoiser, rows, batch, jnp.asarray(due[1] - due[0], jnp.int32), pet
         )
         self._state = GuideState(q, q_optimizer, spread, adapters, optimizer)
         self._moments = self._moments.update(np.asarray(rows.raw_observations)[np.asarray(rows.weights) > 0])
         self.iteration += 1
-        self.metrics = {name: float(v) for name, v in (proposed | learned | adapted).items()}
+        self.metrics = {name: float(v) for name, v in (of_proposals | learned | adapted).items()}
         # Rows in which no transition happened can fill up the subset; nobody else would know them from the others.
         kept = np.flatnonzero(np.asarray(gated.gate))
         return self._in_environment_units(jax.tree.map(lambda x: x[kept], gated.proposals))

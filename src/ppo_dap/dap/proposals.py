@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import ProposalConfig
 from ppo_dap.dap.guidance import (
@@ -20,7 +23,7 @@ from ppo_dap.dap.guidance import (
 from ppo_dap.nets.adapters import Adapters
 from ppo_dap.nets.critic import QFunction
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-from ppo_dap.priors.samplers import Field, sample_actions
+from ppo_dap.priors.samplers import Field, Solver, sample_actions
 
 
 class Proposals(eqx.Module):
@@ -50,10 +53,33 @@ class States(eqx.Module):
     """What Q reads."""
 
 
-def choose_states(weights: Float[Array, " rows"], key: PRNGKeyArray, num: int) -> Int[Array, " {num}"]:
+class ProposalDraws(NamedTuple):
+    """The random numbers of the proposals on one part of D_on."""
+
+    order: Float[Array, " rows"]
+    """Uniform; the states with the smallest get proposals."""
+    noise: Float[Array, "draws n k act"]
+    """Unit noise of the sampler."""
+    resample: Float[Array, "n k"]
+    """Uniform; for drawing D_syn by the energy weights."""
+
+    @staticmethod
+    def make(rng: np.random.Generator, rows: int, states: int, action_size: int, config: ProposalConfig):
+        """Draws for proposals on `states` of `rows`."""
+        k = config.num_proposals
+        noise = solver(config).noise_shape(states, k, action_size)
+        uniforms = (rng.random(shape, dtype=np.float32) for shape in ((rows,), (states, k)))
+        return ProposalDraws(next(uniforms), rng.standard_normal(noise, dtype=np.float32), next(uniforms))  # type: ignore[arg-type]
+
+
+def solver(config: ProposalConfig) -> Solver:
+    """The configured sampler."""
+    return Solver(config.sampler, config.sampler_steps)
+
+
+def choose_states(weights: Float[Array, " rows"], uniform: Float[Array, " rows"], num: int) -> Int[Array, " {num}"]:
     """Indices of `num` different rows of D_on, uniform over those with weight (rows without come last)."""
-    order = jnp.where(weights > 0, jax.random.uniform(key, weights.shape), 2.0)
-    return jnp.argsort(order)[:num]
+    return jnp.argsort(jnp.where(weights > 0, uniform, 2.0))[:num]
 
 
 def propose(
@@ -61,7 +87,7 @@ def propose(
     adapters: Adapters | None,
     q: QFunction,
     states: States,
-    key: PRNGKeyArray,
+    draws: ProposalDraws,
     beta: Float[Array, ""],
     q_spread: Float[Array, ""],
     *,
@@ -72,18 +98,15 @@ def propose(
 
     `q_spread` is the running global scale of Q; the metric `q_spread` is this batch's, to update it with.
     """
-    sample_key, resample_key = jax.random.split(key)
     drift = q_drift(q, states.features, diffusion.sigma_max, config) if "gradient" in config.guidance else None
     candidates, displacement = sample_actions(
         denoiser,
         adapters,
         states.raw_observations,
         jnp.zeros((states.observations.shape[0], diffusion.num_conditions)),
-        sample_key,
-        config.num_proposals,
+        draws.noise,
+        solver(config),
         diffusion,
-        sampler=config.sampler,
-        num_steps=config.sampler_steps,
         drift=drift,
         displacement_cap=config.displacement_cap,
     )
@@ -93,9 +116,7 @@ def propose(
     beta = beta if "energy" in config.guidance else jnp.zeros(())
     weights = energy_weights(values, beta, scale, top_k_mask(values, config.top_k))
     if "energy" in config.guidance or config.top_k is not None:
-        chosen = jax.random.categorical(
-            resample_key, jnp.log(weights)[:, None, :], axis=-1, shape=(weights.shape[0], config.num_proposals)
-        )
+        chosen = resample(weights, draws.resample)
     else:
         chosen = jnp.broadcast_to(jnp.arange(config.num_proposals)[None], weights.shape)
     actions = jnp.take_along_axis(candidates, chosen[..., None], axis=1)
@@ -120,6 +141,14 @@ def q_drift(q: QFunction, features: Float[Array, "n width"], sigma_max: float, c
         return guidance_step(q_gradient(x), alpha, config.guidance_cap, config.cap_on)
 
     return drift
+
+
+def resample(weights: Float[Array, "n k"], uniform: Float[Array, "n draws"]) -> Int[Array, "n draws"]:
+    """Indices drawn with replacement by `weights`, from uniform numbers through the inverse distribution function."""
+    edges = jnp.cumsum(weights, axis=1)
+    # Scaled by the last edge: rounding must not leave a gap above it. The strict comparison never lands on weight 0.
+    reached = (uniform * edges[:, -1:])[:, :, None] >= edges[:, None, :]
+    return jnp.minimum(jnp.sum(reached, axis=-1), weights.shape[1] - 1)
 
 
 def gaussian_proxy(

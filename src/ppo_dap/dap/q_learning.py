@@ -8,11 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import QConfig
 from ppo_dap.nets.critic import Critic, QFunction, q_features
 from ppo_dap.ppo.surrogate import weighted_mean
+from ppo_dap.ppo.update import deal
 
 ADAM: Any = optax.scale_by_adam(eps=1e-5)
 
@@ -43,12 +44,12 @@ def fit_q(
     critic: Critic | None,
     optimizer: optax.OptState,
     rows: QData,
-    key: PRNGKeyArray,
+    orders: Int[Array, "epochs rows"],
     *,
     minibatch_size: int,
     config: QConfig,
 ) -> tuple[QFunction, Critic | None, optax.OptState, Float[Array, ""]]:
-    """`q_epochs` passes over D_on. The critic comes back as it was, except its trunk when it is shared."""
+    """A pass over D_on in each of `orders`. The critic comes back as it was, except its trunk when it is shared."""
     num_minibatches = rows.targets.shape[0] // minibatch_size
     shared = config.q_trunk == "shared"
 
@@ -62,11 +63,9 @@ def fit_q(
         params = jax.tree.map(lambda p, u: p - config.q_learning_rate * u, params, updates)
         return (params, optimizer), loss
 
-    def epoch(carry, epoch_key):
-        order = jax.random.permutation(epoch_key, rows.targets.shape[0])
-        batches = jax.tree.map(lambda x: x[order].reshape(num_minibatches, -1, *x.shape[1:]), rows)
-        return jax.lax.scan(step, carry, batches)
+    def epoch(carry, order):
+        return jax.lax.scan(step, carry, deal(rows, order, num_minibatches))
 
     start = (trainable(q, critic, config), optimizer)
-    (params, optimizer), losses = jax.lax.scan(epoch, start, jax.random.split(key, config.q_epochs))
+    (params, optimizer), losses = jax.lax.scan(epoch, start, orders)
     return params[0], with_trunk(params), optimizer, jnp.mean(losses)

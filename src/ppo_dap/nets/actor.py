@@ -7,7 +7,8 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float
 
 from ppo_dap.nets.mlp import MLP
 
@@ -19,10 +20,10 @@ class Actor(eqx.Module):
     log_std: Float[Array, " act"]
 
     @staticmethod
-    def create(key: PRNGKeyArray, observation_size: int, action_size: int, hidden_size: int) -> Actor:
+    def create(rng: np.random.Generator, observation_size: int, action_size: int, hidden_size: int) -> Actor:
         """Orthogonal start, gain 0.01 on the mean head, standard deviation 1."""
         sizes = (observation_size, hidden_size, hidden_size, action_size)
-        return Actor(MLP.create(key, sizes, "tanh", final_gain=0.01), jnp.zeros(action_size))
+        return Actor(MLP.create(rng, sizes, "tanh", final_gain=0.01), jnp.asarray(np.zeros(action_size, np.float32)))
 
     def __call__(self, observations: Float[Array, "n obs"]) -> Float[Array, "n act"]:
         """Means at normalised observations."""

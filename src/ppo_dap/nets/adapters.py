@@ -7,12 +7,13 @@ identity of the backbone and still learns (with both at zero no gradient would e
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float
 
 from ppo_dap.errors import unknown
 from ppo_dap.nets.mlp import Linear, silu
@@ -61,28 +62,30 @@ class Adapters(eqx.Module):
 _KINDS = {"lora": LoRA, "bottleneck": Bottleneck}
 
 
-def init_adapters(key: PRNGKeyArray, backbone: Backbone, kind: str, rank: int) -> Adapters:
+def init_adapters(rng: np.random.Generator, backbone: Backbone, kind: str, rank: int) -> Adapters:
     """Adapters that leave `backbone` exactly as it is until their first step."""
     if kind not in _KINDS:
         raise unknown("adapter", kind, _KINDS)
-    keys = jax.random.split(key, len(backbone.hidden))
-    return Adapters(tuple(_init_one(k, layer, kind, rank) for k, layer in zip(keys, backbone.hidden, strict=True)))
+    return Adapters(tuple(_init_one(rng, layer, kind, rank) for layer in backbone.hidden))
 
 
-def _init_one(key: PRNGKeyArray, layer: Linear, kind: str, rank: int) -> LoRA | Bottleneck:
+def _init_one(rng: np.random.Generator, layer: Linear, kind: str, rank: int) -> LoRA | Bottleneck:
     out_size, in_size = layer.weight.shape
     width = in_size if kind == "lora" else out_size
-    down = jax.random.normal(key, (rank, width), jnp.float32) / width**0.5
-    return _KINDS[kind](down, jnp.zeros((out_size, rank), jnp.float32))
+    down = rng.standard_normal((rank, width)) / width**0.5
+    return _KINDS[kind](jnp.asarray(down, jnp.float32), jnp.asarray(np.zeros((out_size, rank), np.float32)))
 
 
 def apply_hidden(
-    layer: Linear, adapter: LoRA | Bottleneck | None, h: Float[Array, "*batch in"]
+    layer: Linear,
+    adapter: LoRA | Bottleneck | None,
+    h: Float[Array, "*batch in"],
+    modulate: Callable[[Array], Array] = lambda x: x,
 ) -> Float[Array, "*batch out"]:
-    """A hidden layer with its silu and, where there is one, its adapter."""
+    """A hidden layer with its silu and, where there is one, its adapter; `modulate` comes before the silu."""
     if isinstance(adapter, LoRA):
-        return silu(layer(h) + adapter(h))
-    h = silu(layer(h))
+        return silu(modulate(layer(h) + adapter(h)))
+    h = silu(modulate(layer(h)))
     return h if adapter is None else h + adapter(h)
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float
 
 from ppo_dap.nets.mlp import MLP, Linear
 
@@ -17,12 +18,9 @@ class Critic(eqx.Module):
     v_head: Linear
 
     @staticmethod
-    def create(key: PRNGKeyArray, observation_size: int, hidden_size: int) -> Critic:
+    def create(rng: np.random.Generator, observation_size: int, hidden_size: int) -> Critic:
         """Orthogonal start, gain 1 on the value head."""
-        trunk_key, head_key = jax.random.split(key)
-        return Critic(
-            create_trunk(trunk_key, observation_size, hidden_size), Linear.orthogonal(head_key, hidden_size, 1, 1.0)
-        )
+        return Critic(create_trunk(rng, observation_size, hidden_size), Linear.orthogonal(rng, hidden_size, 1, 1.0))
 
     def features(self, observations: Float[Array, "n obs"]) -> Float[Array, "n width"]:
         """The trunk's features, which Q may read."""
@@ -33,9 +31,9 @@ class Critic(eqx.Module):
         return self.v_head(self.features(observations))[:, 0]
 
 
-def create_trunk(key: PRNGKeyArray, observation_size: int, hidden_size: int) -> MLP:
+def create_trunk(rng: np.random.Generator, observation_size: int, hidden_size: int) -> MLP:
     """Two layers of `hidden_size`; `Critic.features` squashes the last one too."""
-    return MLP.create(key, (observation_size, hidden_size, hidden_size), "tanh", final_gain=2**0.5)
+    return MLP.create(rng, (observation_size, hidden_size, hidden_size), "tanh", final_gain=2**0.5)
 
 
 class QFunction(eqx.Module):
@@ -48,16 +46,20 @@ class QFunction(eqx.Module):
 
     @staticmethod
     def create(
-        key: PRNGKeyArray, observation_size: int, action_size: int, feature_size: int, hidden_size: int, own_trunk: bool
+        rng: np.random.Generator,
+        observation_size: int,
+        action_size: int,
+        feature_size: int,
+        hidden_size: int,
+        own_trunk: bool,
     ) -> QFunction:
         """A head on features of `feature_size`, with a trunk of its own when `own_trunk`."""
-        keys = jax.random.split(key, 4)
-        trunk = create_trunk(keys[0], observation_size, feature_size) if own_trunk else None
+        trunk = create_trunk(rng, observation_size, feature_size) if own_trunk else None
         return QFunction(
             trunk,
-            Linear.orthogonal(keys[1], feature_size, hidden_size, 2**0.5),
-            Linear.orthogonal(keys[2], action_size, hidden_size, 2**0.5),
-            Linear.orthogonal(keys[3], hidden_size, 1, 1.0),
+            Linear.orthogonal(rng, feature_size, hidden_size, 2**0.5),
+            Linear.orthogonal(rng, action_size, hidden_size, 2**0.5),
+            Linear.orthogonal(rng, hidden_size, 1, 1.0),
         )
 
     def __call__(self, features: Float[Array, "n width"], actions: Float[Array, "n k act"]) -> Float[Array, "n k"]:

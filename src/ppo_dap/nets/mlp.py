@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float
 
 Activation = Literal["tanh", "silu"]
 
@@ -27,22 +27,27 @@ class Linear(eqx.Module):
     bias: Float[Array, " out"]
 
     @staticmethod
-    def orthogonal(key: PRNGKeyArray, in_size: int, out_size: int, gain: float = 1.0) -> Linear:
+    def orthogonal(rng: np.random.Generator, in_size: int, out_size: int, gain: float = 1.0) -> Linear:
         """A layer with an orthogonal weight times `gain` and no bias, as PPO's recipe wants it."""
-        weight = jax.nn.initializers.orthogonal(gain)(key, (out_size, in_size), jnp.float32)
-        return Linear(weight, jnp.zeros(out_size, jnp.float32))
+        tall = rng.standard_normal((max(in_size, out_size), min(in_size, out_size)))
+        q, r = np.linalg.qr(tall)
+        q = q * np.sign(np.diag(r))  # uniform over all orthogonal matrices, whatever signs QR chose
+        return _linear(gain * (q if out_size >= in_size else q.T))
 
     @staticmethod
-    def lecun_normal(key: PRNGKeyArray, in_size: int, out_size: int, gain: float = 1.0) -> Linear:
+    def lecun_normal(rng: np.random.Generator, in_size: int, out_size: int, gain: float = 1.0) -> Linear:
         """A layer whose output has `gain` times the spread of its input."""
-        # Not jax.nn.initializers.lecun_normal: it truncates the normal, which takes seconds to compile over a network.
-        weight = jax.random.normal(key, (out_size, in_size), jnp.float32) * (gain / in_size**0.5)
-        return Linear(weight, jnp.zeros(out_size, jnp.float32))
+        return _linear(rng.standard_normal((out_size, in_size)) * (gain / in_size**0.5))
 
     def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
         """Apply the layer to the last axis."""
         y = x @ self.weight.T
         return y + jnp.broadcast_to(self.bias, y.shape)
+
+
+def _linear(weight: np.ndarray) -> Linear:
+    # Networks start on the host: as XLA programs their first numbers would take seconds to compile.
+    return Linear(jnp.asarray(weight, jnp.float32), jnp.asarray(np.zeros(len(weight), np.float32)))
 
 
 class MLP(eqx.Module):
@@ -52,16 +57,15 @@ class MLP(eqx.Module):
     activation: Activation = eqx.field(static=True)
 
     @staticmethod
-    def create(key: PRNGKeyArray, sizes: tuple[int, ...], activation: Activation, final_gain: float) -> MLP:
+    def create(rng: np.random.Generator, sizes: tuple[int, ...], activation: Activation, final_gain: float) -> MLP:
         """Layers from `sizes[0]` inputs to `sizes[-1]` outputs, the last one's initial weight times `final_gain`.
 
         tanh networks start orthogonal with gain sqrt(2), PPO's recipe; silu networks start lecun-normal.
         """
         init, gain = (Linear.orthogonal, 2**0.5) if activation == "tanh" else (Linear.lecun_normal, 1.0)
         gains = [gain] * (len(sizes) - 2) + [final_gain]
-        keys = jax.random.split(key, len(gains))
-        layers = zip(keys, sizes[:-1], sizes[1:], gains, strict=True)
-        return MLP(tuple(init(*layer) for layer in layers), activation)
+        layers = zip(sizes[:-1], sizes[1:], gains, strict=True)
+        return MLP(tuple(init(rng, *layer) for layer in layers), activation)
 
     def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
         """Apply the network to the last axis."""

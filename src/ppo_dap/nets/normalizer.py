@@ -47,6 +47,7 @@ class RewardScale(NamedTuple):
 
     moments: RunningMoments
     discounted: Float[np.ndarray, " envs"]
+    """What the next reward is added to: gamma times the discounted return so far, 0 at an episode's start."""
 
     @staticmethod
     def create(num_envs: int) -> RewardScale:
@@ -61,11 +62,13 @@ class RewardScale(NamedTuple):
         gamma: float,
     ) -> RewardScale:
         """The scale after one rollout; rows that are not `valid` do not count."""
-        discounted, seen = self.discounted.copy(), np.zeros(rewards.shape)
-        for t in range(len(rewards)):
-            discounted = np.where(valid[t], gamma * discounted + rewards[t], discounted)
-            seen[t] = discounted
-            discounted = np.where(ended[t], 0.0, discounted)
+        discounted, seen = self.discounted.copy(), np.empty(rewards.shape)
+        # Worked out for all rows at once; the loop is what has to be one.
+        factors = np.where(ended, 0.0, np.where(valid, gamma, 1.0))
+        for row, reward, factor in zip(seen, np.where(valid, rewards, 0.0), factors, strict=True):
+            discounted += reward
+            row[:] = discounted
+            discounted *= factor
         return RewardScale(self.moments.update(seen[valid][:, None]), discounted)
 
     def restart(self) -> RewardScale:

@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ppo_dap.nets.policy import Policy
 from ppo_dap.tasks import VectorEnv
 
+# A collector's arrays are numpy's; inside a jitted stage, where they are used, they are JAX's.
+if TYPE_CHECKING:
+    Numbers = Array
+else:
+    Numbers = Array | np.ndarray
+
 
 class Rollout(eqx.Module):
-    """D_on of one iteration. Observations are raw, actions scaled and not clipped (as sampled)."""
+    """D_on of one iteration, or a part of it. Observations are raw, actions scaled and not clipped (as sampled)."""
 
-    state_ids: Int[Array, "time envs"]
+    state_ids: Int[Numbers, "time envs"]
     """Unique over a run: `iteration * rows + row`. What proposals and PET minibatches are traced by."""
-    observations: Float[Array, "time envs obs"]
-    next_observations: Float[Array, "time envs obs"]
-    actions: Float[Array, "time envs act"]
-    log_probs: Float[Array, "time envs"]
-    means: Float[Array, "time envs act"]
-    rewards: Float[Array, "time envs"]
-    terminated: Bool[Array, "time envs"]
-    truncated: Bool[Array, "time envs"]
-    valid: Bool[Array, "time envs"]
+    observations: Float[Numbers, "time envs obs"]
+    next_observations: Float[Numbers, "time envs obs"]
+    actions: Float[Numbers, "time envs act"]
+    log_probs: Float[Numbers, "time envs"]
+    means: Float[Numbers, "time envs act"]
+    rewards: Float[Numbers, "time envs"]
+    terminated: Bool[Numbers, "time envs"]
+    truncated: Bool[Numbers, "time envs"]
+    valid: Bool[Numbers, "time envs"]
 
 
 @dataclass
@@ -46,17 +53,31 @@ class Collector:
         self.observations = self.env.reset()
         self.returns = np.zeros(self.env.num_envs)
 
-    def collect(self, policy: Policy, steps: int, iteration: int, rng: np.random.Generator) -> Rollout:
-        """`steps` rows over all environments, sampled from `policy`, with rewards as the task gives them."""
-        envs = self.env.num_envs
-        time, act = steps // envs, len(policy.log_std)
-        noise = rng.standard_normal((time, envs, act), dtype=np.float32)
+    def collect(
+        self, policy: Policy, steps: int, parts: int, iteration: int, rng: np.random.Generator
+    ) -> Iterator[Rollout]:
+        """`steps` rows over all environments, sampled from `policy`, with rewards as the task gives them.
+
+        They come in `parts` of one length, each as soon as it has been collected. Arrays are numpy's, and nobody
+        writes to them again.
+        """
+        envs, act = self.env.num_envs, len(policy.log_std)
+        time = steps // envs // parts
         std = np.exp(policy.log_std)
         self.env_seconds = 0.0
+        for part in range(parts):
+            noise = rng.standard_normal((time, envs, act), dtype=np.float32)
+            out = self._part(policy, noise, std * noise)
+            first = (iteration * parts + part) * time * envs
+            ids = np.arange(first, first + time * envs, dtype=np.int32).reshape(time, envs)
+            yield Rollout(**out, log_probs=policy.log_prob_of_noise(noise), state_ids=ids)  # type: ignore[arg-type]
+
+    def _part(self, policy: Policy, noise: np.ndarray, spread: np.ndarray) -> dict[str, np.ndarray]:
+        time, envs, act = noise.shape
         out = _empty(time, envs, self.observations.shape[1], act)
         for t in range(time):
             mean = policy.mean(self.observations)
-            action = mean + std * noise[t]
+            action = mean + spread[t]
             actions = policy.unscale(action)
             start = clock.perf_counter()
             step = self.env.step(actions)
@@ -67,11 +88,7 @@ class Collector:
             out["terminated"][t], out["truncated"][t] = step.terminated, step.truncated
             self._count(step)
             self.observations = step.observations
-        out["log_probs"] = policy.log_prob_of_noise(noise)
-        rows = np.arange(time * envs, dtype=np.int32) + np.int32(iteration * time * envs)
-        return Rollout(
-            **{name: jnp.asarray(x) for name, x in out.items()}, state_ids=jnp.asarray(rows.reshape(time, envs))
-        )
+        return out
 
     def _count(self, step) -> None:
         self.returns += step.rewards

@@ -6,15 +6,16 @@ PPO's gradient: PPO's part of the program is the same whether there is such a te
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
 from ppo_dap.config import PPOConfig
 from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
@@ -35,11 +36,10 @@ class PPOState(eqx.Module):
     critic_optimizer: optax.OptState
 
     @staticmethod
-    def create(key: PRNGKeyArray, observation_size: int, action_size: int, hidden_size: int) -> PPOState:
+    def create(rng: np.random.Generator, observation_size: int, action_size: int, hidden_size: int) -> PPOState:
         """Fresh networks."""
-        actor_key, critic_key = jax.random.split(key)
-        actor = Actor.create(actor_key, observation_size, action_size, hidden_size)
-        critic = Critic.create(critic_key, observation_size, hidden_size)
+        actor = Actor.create(rng, observation_size, action_size, hidden_size)
+        critic = Critic.create(rng, observation_size, hidden_size)
         return PPOState(actor, critic, ADAM.init(actor), ADAM.init(critic))
 
 
@@ -60,11 +60,10 @@ class Rows(eqx.Module):
 
 
 class Normaliser(NamedTuple):
-    """Statistics frozen for one iteration."""
+    """The observations' statistics, frozen for one iteration."""
 
     mean: Float[Array, " obs"]
     std: Float[Array, " obs"]
-    reward_std: Float[Array, ""]
 
     def __call__(self, observations: Float[Array, "*n obs"], clip: float) -> Float[Array, "*n obs"]:
         """Normalised observations."""
@@ -73,8 +72,14 @@ class Normaliser(NamedTuple):
         return jnp.clip((observations - mean) / std, -clip, clip)
 
 
-def estimate_advantages(critic: Critic, rollout: Rollout, normaliser: Normaliser, ppo: PPOConfig) -> Rows:
-    """Step 2: values, GAE, regression targets; and the one-step target of Q, r + gamma (1 - terminated) V(s')."""
+def estimate_advantages(
+    critic: Critic, parts: Sequence[Rollout], normaliser: Normaliser, reward_std: Float[Array, ""], ppo: PPOConfig
+) -> Rows:
+    """Step 2: values, GAE, regression targets; and the one-step target of Q, r + gamma (1 - terminated) V(s').
+
+    `parts` follow each other in time; rewards are divided by `reward_std`.
+    """
+    rollout = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     time, envs = rollout.rewards.shape
 
     def flat(x):
@@ -83,7 +88,7 @@ def estimate_advantages(critic: Critic, rollout: Rollout, normaliser: Normaliser
     observations = normaliser(flat(rollout.observations), ppo.observation_clip)
     successors = normaliser(flat(rollout.next_observations), ppo.observation_clip)
     values, next_values = critic(observations), critic(successors)
-    rewards = jnp.clip(rollout.rewards / normaliser.reward_std, -ppo.reward_clip, ppo.reward_clip)
+    rewards = jnp.clip(rollout.rewards / reward_std, -ppo.reward_clip, ppo.reward_clip)
     grid = (time, envs)
     advantages = gae(
         rewards,
@@ -134,6 +139,13 @@ def nothing_to_add(actor: Actor, minibatch: Any, weights: Any) -> tuple[Actor, d
     return actor, {}
 
 
+class Orders(NamedTuple):
+    """In which order each epoch of the actor's deals out D_on's rows, and the rows of what the method adds."""
+
+    rows: Int[Array, "epochs rows"]
+    added: Int[Array, "epochs n"]
+
+
 class Settings(NamedTuple):
     """Numbers that change from iteration to iteration (traced, so that nothing recompiles)."""
 
@@ -151,7 +163,7 @@ def improve_actor(
     optimizer: optax.OptState,
     rows: Rows,
     added: Any,
-    key: PRNGKeyArray,
+    orders: Orders,
     settings: Settings,
     *,
     ppo: PPOConfig,
@@ -160,7 +172,7 @@ def improve_actor(
     """Step 4, the actor: `num_epochs` passes over D_on in shuffled minibatches, fewer when the KL rule stops them.
 
     `added` holds what `added_gradient` sees, with a multiple of the number of minibatches as leading axis; it is
-    shuffled and dealt out like D_on's rows, by a random stream of its own. The metric `pgshare` is Eq. 13: the norm of
+    shuffled and dealt out like D_on's rows, by orders of its own. The metric `pgshare` is Eq. 13: the norm of
     PPO's gradient over that of the whole.
     """
     num_minibatches = ppo.rollout_steps // ppo.minibatch_size
@@ -169,25 +181,22 @@ def improve_actor(
     def minibatch_step(carry, batch):
         return _actor_step(carry, batch, settings, old_log_std, ppo, added_gradient)
 
-    def run(carry, epoch_key):
-        batches = (
-            _deal(rows, epoch_key, num_minibatches),
-            _deal(added, jax.random.fold_in(epoch_key, 1), num_minibatches),
-        )
+    def run(carry, order):
+        batches = deal(rows, order.rows, num_minibatches), deal(added, order.added, num_minibatches)
         carry, metrics = jax.lax.scan(minibatch_step, carry, batches)
         return carry, jnp.mean(metrics["policy_kl_minibatch"]) > settings.kl_limit, metrics
 
-    def skip(carry, epoch_key):
-        shapes = jax.eval_shape(run, carry, epoch_key)[2]
+    def skip(carry, order):
+        shapes = jax.eval_shape(run, carry, order)[2]
         return carry, jnp.array(True), jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), shapes)
 
-    def epoch(carry, epoch_key):
+    def epoch(carry, order):
         learned, stopped = carry
-        learned, stopped, metrics = jax.lax.cond(stopped, skip, run, learned, epoch_key)
+        learned, stopped, metrics = jax.lax.cond(stopped, skip, run, learned, order)
         return (learned, stopped), metrics
 
     start = ((actor, optimizer), jnp.array(False))
-    ((actor, optimizer), _), metrics = jax.lax.scan(epoch, start, jax.random.split(key, ppo.num_epochs))
+    ((actor, optimizer), _), metrics = jax.lax.scan(epoch, start, orders)
     summary = {name: jnp.nanmean(values) for name, values in metrics.items()}
     summary["ratio_error"] = metrics["ratio_error"][0, 0]
     summary["actor_updates"] = jnp.sum(~jnp.isnan(metrics["policy_kl_minibatch"])).astype(jnp.float32)
@@ -224,7 +233,7 @@ def improve_critic(
     critic: Critic,
     optimizer: optax.OptState,
     rows: Rows,
-    key: PRNGKeyArray,
+    orders: Int[Array, "epochs rows"],
     learning_rate: Float[Array, ""],
     *,
     ppo: PPOConfig,
@@ -239,11 +248,10 @@ def improve_critic(
         gradient = jax.tree.map(lambda g: ppo.value_coefficient * g, gradient)
         return _adam(critic, gradient, optimizer, learning_rate, ppo.max_grad_norm), loss
 
-    def epoch(carry, epoch_key):
-        return jax.lax.scan(step, carry, _deal(rows, epoch_key, ppo.rollout_steps // ppo.minibatch_size))
+    def epoch(carry, order):
+        return jax.lax.scan(step, carry, deal(rows, order, ppo.rollout_steps // ppo.minibatch_size))
 
-    keys = jax.random.split(key, ppo.num_epochs)
-    (critic, optimizer), losses = jax.lax.scan(epoch, (critic, optimizer), keys)
+    (critic, optimizer), losses = jax.lax.scan(epoch, (critic, optimizer), orders)
     return critic, optimizer, {"value_loss": jnp.mean(losses)}
 
 
@@ -254,8 +262,11 @@ def _adam(params, gradient, optimizer_state, learning_rate, max_norm: float):
     return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), optimizer_state
 
 
-def _deal(rows, key: PRNGKeyArray, num_minibatches: int):
-    """Rows in a new random order, with a leading axis of minibatches."""
-    count = jax.tree.leaves(rows)[0].shape[0] if jax.tree.leaves(rows) else 0
-    order = jax.random.permutation(key, count)
+def deal(rows, order: Int[Array, " rows"], num_minibatches: int):
+    """Rows in the given order, with a leading axis of minibatches."""
     return jax.tree.map(lambda x: x[order].reshape(num_minibatches, -1, *x.shape[1:]), rows)
+
+
+def draw_orders(rng: np.random.Generator, epochs: int, rows: int) -> Int[np.ndarray, "{epochs} {rows}"]:
+    """A random order of the rows for each epoch."""
+    return rng.permuted(np.tile(np.arange(rows, dtype=np.int32), (epochs, 1)), axis=1)

@@ -12,16 +12,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from ppo_dap.errors import InputError, TrainingDiverged, unknown
 from ppo_dap.logs.dataset import Logs
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, denoising_loss
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, LossDraws, denoising_loss
 from ppo_dap.priors.prior import DiffusionPrior, scale_actions
 
 PROBE_ROWS = 256
 VALIDATION_ROWS = 8192
 SMALLEST_SIGMA_DATA = 0.05
+FIT_STREAM = 3
+"""Keeps the fit's random numbers apart from those of the split of episodes."""
 
 
 class Rows(NamedTuple):
@@ -78,7 +80,7 @@ def fit_diffusion(logs: Logs, seed: int, progress: Progress | None, options: dic
     if config.num_conditions:
         raise InputError("num_conditions must be 0: logs carry no condition (use train_denoiser with rows that do)")
     train, held_out = (_rows(part, low, high) for part in logs.split(config.validation_fraction, seed))
-    denoiser, training = train_denoiser(train, held_out, config, jax.random.key(seed), progress)
+    denoiser, training = train_denoiser(train, held_out, config, seed, progress)
     chosen = np.random.default_rng(seed).permutation(train.actions.shape[0])[:PROBE_ROWS]
     return DiffusionPrior(
         denoiser=denoiser,
@@ -121,18 +123,23 @@ def _rows(logs: Logs, low: np.ndarray, high: np.ndarray) -> Rows:
 
 
 def train_denoiser(
-    train: Rows, held_out: Rows, config: DiffusionConfig, key: PRNGKeyArray, progress: Progress | None = None
+    train: Rows, held_out: Rows, config: DiffusionConfig, seed: int, progress: Progress | None = None
 ) -> tuple[Denoiser, dict[str, Any]]:
     """Minimise Eq. 6 on `train`; returns the averaged weights that were best on `held_out`, and a summary."""
-    init_key, train_key, pick_key, validation_key = jax.random.split(key, 4)
-    state = init_state(train, config, init_key)
+    rng = np.random.default_rng([seed, FIT_STREAM])
+    state = init_state(train, config, rng)
     # A fixed random subset, in random order and with the same noise at every look: looks differ by the weights alone.
-    picked = jax.random.permutation(pick_key, held_out.actions.shape[0])[:VALIDATION_ROWS]
+    picked = rng.permutation(held_out.actions.shape[0])[:VALIDATION_ROWS]
     held_out = Rows(*(a[picked] for a in held_out))
+    held_out_draws = LossDraws.make(rng, *held_out.actions.shape)
+    size, act = (config.chunk_steps, config.batch_size), train.actions.shape[1]
     best, best_loss, best_step, step, train_loss = state.ema, float("inf"), 0, 0, float("nan")
     start = time.perf_counter()
     while step < config.max_steps:
-        state, losses = train_chunk(state, train, held_out, train_key, validation_key, config)
+        picks = rng.integers(0, train.actions.shape[0], size, dtype=np.int32)
+        state, losses = train_chunk(
+            state, train, held_out, picks, LossDraws.make(rng, *size, act), held_out_draws, config
+        )
         step = int(state.step)
         train_loss, validation_loss = (float(loss) for loss in losses)
         if not (np.isfinite(train_loss) and np.isfinite(validation_loss)):
@@ -155,13 +162,13 @@ def train_denoiser(
     return best, summary
 
 
-def init_state(rows: Rows, config: DiffusionConfig, key: PRNGKeyArray) -> FitState:
+def init_state(rows: Rows, config: DiffusionConfig, rng: np.random.Generator) -> FitState:
     """A fresh denoiser with the rows' moments; a constant observation gets spread 1, so that it stays constant."""
     std = np.std(np.asarray(rows.observations, np.float64), axis=0)
     sigma_data = max(float(np.std(np.asarray(rows.actions, np.float64))), SMALLEST_SIGMA_DATA)
     mean = np.mean(np.asarray(rows.observations, np.float64), axis=0)
     denoiser = Denoiser.create(
-        key,
+        rng,
         config,
         jnp.asarray(mean, jnp.float32),
         jnp.asarray(np.where(std > 1e-6, std, 1.0), jnp.float32),
@@ -182,18 +189,18 @@ def train_chunk(
     state: FitState,
     train: Rows,
     held_out: Rows,
-    train_key: PRNGKeyArray,
-    validation_key: PRNGKeyArray,
+    picks: Int[Array, "steps batch"],
+    draws: LossDraws,
+    held_out_draws: LossDraws,
     config: DiffusionConfig,
 ) -> tuple[FitState, tuple[Float[Array, ""], Float[Array, ""]]]:
-    """`chunk_steps` steps as one program, then the mean training loss and the held-out loss of the averaged weights."""
+    """Steps on the picked rows as one program; the mean training loss, and the averaged weights' held-out loss."""
     optimizer = _optimizer(config)
 
-    def step(state: FitState, _):
-        row_key, noise_key = jax.random.split(jax.random.fold_in(train_key, state.step))
-        picked = jax.random.randint(row_key, (config.batch_size,), 0, train.actions.shape[0])
+    def step(state: FitState, inputs):
+        picked, noise = inputs
         batch = Rows(*(a[picked] for a in train))
-        loss, gradient = jax.value_and_grad(denoising_loss)(state.denoiser, None, *batch, noise_key, config)
+        loss, gradient = jax.value_and_grad(denoising_loss)(state.denoiser, None, *batch, noise, config)
         updates, moments = optimizer.update(gradient, state.optimizer)
         denoiser = jax.tree.map(jnp.add, state.denoiser, updates)
         # Early averages must not remember the random start.
@@ -202,6 +209,6 @@ def train_chunk(
         ema = jax.tree.map(lambda e, w: e + (1 - decay) * (w - e), state.ema, denoiser)
         return FitState(denoiser, ema, moments, state.step + 1), loss
 
-    state, losses = jax.lax.scan(step, state, length=config.chunk_steps)
-    validation = denoising_loss(state.ema, None, *held_out, validation_key, config)
+    state, losses = jax.lax.scan(step, state, (picks, draws))
+    validation = denoising_loss(state.ema, None, *held_out, held_out_draws, config)
     return state, (jnp.mean(losses), validation)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ppo_dap.errors import InputError, unknown
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-from ppo_dap.priors.samplers import sample_actions
+from ppo_dap.priors.samplers import Solver, sample_actions
 from ppo_dap.storage import read_tensors, tree_from_tensors, tree_to_tensors, write_tensors
 
 FORMAT = 1
@@ -124,7 +124,9 @@ class DiffusionPrior:
         if condition.shape[1] != wanted:
             raise InputError(f"condition has {condition.shape[1]} numbers, the prior's {wanted}")
         inputs = jnp.asarray(observations, jnp.float32), jnp.asarray(condition, jnp.float32)
-        scaled = _sample(self.denoiser, *inputs, key, num, self.config)
+        solver = Solver(self.config.sampler, self.config.sampler_steps)
+        noise = jax.random.normal(key, solver.noise_shape(observations.shape[0], num, self.action_size))
+        scaled = _sample(self.denoiser, *inputs, noise, solver, self.config)
         return unscale_actions(scaled, self.action_low, self.action_high)
 
     def save(self, path: str | Path) -> None:
@@ -152,8 +154,11 @@ class DiffusionPrior:
     def from_file(tensors: dict[str, np.ndarray], header: dict[str, Any], source: object) -> DiffusionPrior:
         """The prior that `save` wrote as `tensors` and `header`."""
         config = DiffusionConfig(**header["config"])
-        moments = jnp.zeros(header["observation_size"]), jnp.ones(header["observation_size"]), jnp.ones(())
-        blank = Denoiser.create(jax.random.key(0), config, *moments, header["action_size"])
+        sizes = (header["observation_size"],), (header["observation_size"],), ()
+        blank = jax.eval_shape(
+            lambda *moments: Denoiser.create(np.random.default_rng(0), config, *moments, header["action_size"]),
+            *(jax.ShapeDtypeStruct(size, jnp.float32) for size in sizes),
+        )
         missing = [name for name in _ARRAYS if name not in tensors]
         if missing:
             raise InputError(f"{source} is damaged: {missing[0]} is missing")
@@ -170,9 +175,9 @@ class DiffusionPrior:
 _ARRAYS = ("action_low", "action_high", "probe_observations", "probe_actions")
 
 
-@partial(jax.jit, static_argnames=("num", "config"))
-def _sample(denoiser, observations, condition, key, num, config):
-    return sample_actions(denoiser, None, observations, condition, key, num, config)[0]
+@partial(jax.jit, static_argnames=("solver", "config"))
+def _sample(denoiser, observations, condition, noise, solver, config):
+    return sample_actions(denoiser, None, observations, condition, noise, solver, config)[0]
 
 
 _KINDS = {"diffusion": DiffusionPrior}

@@ -8,10 +8,11 @@ All actions are scaled to [-1, 1]; denoised actions are clamped to that box, and
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from ppo_dap.errors import unknown
 from ppo_dap.nets.adapters import Adapters, merge
@@ -110,36 +111,41 @@ def centred_start(denoise: Field, sigma: Float[Array, ""], noise: Float[Array, "
 SAMPLERS = {"ancestral": ancestral, "dpmpp_2m": dpmpp_2m}
 
 
+class Solver(NamedTuple):
+    """A sampler by name and its number of steps."""
+
+    name: str
+    num_steps: int
+
+    def noise_shape(self, *size: int) -> tuple[int, ...]:
+        """Shape of the unit noise for actions of `size`: all of it is drawn before the loop, the deterministic
+        solver's is its start alone. Raises `InputError` for an unknown sampler.
+        """
+        if self.name not in SAMPLERS:
+            raise unknown("sampler", self.name, SAMPLERS)
+        return (1 if self.name == "dpmpp_2m" else self.num_steps + 1, *size)
+
+
 def sample_actions(
     denoiser: Denoiser,
     adapters: Adapters | None,
     observations: Float[Array, "n obs"],
     condition: Float[Array, "n c"],
-    key: PRNGKeyArray,
-    num: int,
+    noise: Float[Array, "draws n k act"],
+    solver: Solver,
     config: DiffusionConfig,
     *,
-    sampler: str | None = None,
-    num_steps: int | None = None,
     drift: Field | None = None,
     displacement_cap: float | Float[Array, ""] | None = None,
-) -> tuple[Float[Array, "n {num} act"], Float[Array, "n {num}"]]:
-    """`num` actions a state, and how far guidance moved each; sampler and steps are the config's unless given."""
-    sampler = config.sampler if sampler is None else sampler
-    if sampler not in SAMPLERS:
-        raise unknown("sampler", sampler, SAMPLERS)
-    num_steps = config.sampler_steps if num_steps is None else num_steps
+) -> tuple[Float[Array, "n k act"], Float[Array, "n k"]]:
+    """k actions a state from `noise` of the shape `solver.noise_shape` gives, and how far guidance moved each."""
     denoiser, adapters = merge(denoiser, adapters)
     embedding = denoiser.embed(observations, condition)
-    sigmas = karras_sigmas(num_steps, config.sigma_min, config.sigma_max, config.rho)
-    # All noise in one draw outside the loop; the deterministic solver needs only its start.
-    deterministic = sampler == "dpmpp_2m"
-    draws = 1 if deterministic else num_steps + 1
-    noise = jax.random.normal(key, (draws, observations.shape[0], num, denoiser.out.weight.shape[0]))
+    sigmas = karras_sigmas(solver.num_steps, config.sigma_min, config.sigma_max, config.rho)
 
     def denoise(x, sigma):
         return denoiser(x, embedding, sigma, adapters)
 
-    if deterministic:
+    if solver.name == "dpmpp_2m":
         noise = centred_start(denoise, sigmas[0], noise[0])[None]
-    return SAMPLERS[sampler](denoise, sigmas, noise, drift, displacement_cap)
+    return SAMPLERS[solver.name](denoise, sigmas, noise, drift, displacement_cap)

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import Config
 from ppo_dap.dap import audit
-from ppo_dap.dap.guide import GuideState, adapt_prior, create_guide, learn_q, make_proposals, on_policy
+from ppo_dap.dap.guide import (
+    GuideState,
+    Proposed,
+    Visited,
+    adapt_prior,
+    create_guide,
+    gate_proposals,
+    learn_q,
+    make_proposals,
+    on_policy,
+)
 from ppo_dap.dap.objective import Batch, admit, proposal_gradient
+from ppo_dap.dap.proposals import ProposalDraws
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import Normaliser, PPOState, Rows, Settings, estimate_advantages, improve_actor, improve_critic
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
+from ppo_dap.training.draws import Draws
+
+NETWORK_STREAM = 5
 
 Metrics = dict[str, Float[Array, ""]]
 
@@ -46,12 +61,13 @@ class Schedule(NamedTuple):
     pet_steps: Int[Array, ""]
 
 
-def create_learner(key: PRNGKeyArray, sizes: tuple[int, int], config: Config, denoiser: Denoiser | None) -> Learner:
-    """Fresh networks; the guide's random stream is its own, so PPO's start does not depend on it."""
-    ppo = PPOState.create(key, *sizes, config.ppo.hidden_size)
+def create_learner(sizes: tuple[int, int], config: Config, denoiser: Denoiser | None) -> Learner:
+    """Fresh networks by the config's seed; the guide's come after PPO's, whose start does not depend on them."""
+    rng = np.random.default_rng([config.run.seed, NETWORK_STREAM])
+    ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size)
     if denoiser is None:
         return Learner(ppo, None)
-    return Learner(ppo, create_guide(jax.random.fold_in(key, 1), ppo.critic, sizes, config, denoiser))
+    return Learner(ppo, create_guide(rng, ppo.critic, sizes, config, denoiser))
 
 
 class Stages:
@@ -64,7 +80,8 @@ class Stages:
         self.critic = jax.jit(partial(improve_critic, ppo=config.ppo))
         self.policy_metrics = jax.jit(audit.policy_metrics)
         if diffusion is not None:
-            self.propose = jax.jit(partial(make_proposals, config=config, diffusion=diffusion))
+            self.propose = jax.jit(partial(_propose, config=config, diffusion=diffusion))
+            self.gate = jax.jit(gate_proposals)
             self.learn_q = jax.jit(partial(learn_q, config=config))
             self.adapt = jax.jit(partial(adapt_prior, config=config, diffusion=diffusion))
             self.leakage = jax.jit(partial(audit.leakage, ppo=config.ppo))
@@ -72,12 +89,40 @@ class Stages:
 
 
 def _advantages(
-    critic: Critic, rollout: Rollout, normaliser: Normaliser, first_id: Int[Array, ""], *, config: Config
+    critic: Critic,
+    parts: Sequence[Rollout],
+    normaliser: Normaliser,
+    reward_std: Float[Array, ""],
+    first_id: Int[Array, ""],
+    *,
+    config: Config,
 ) -> tuple[Rows, Batch, Metrics]:
-    rows = estimate_advantages(critic, rollout, normaliser, config.ppo)
+    rows = estimate_advantages(critic, parts, normaliser, reward_std, config.ppo)
     batch = Batch(first_id, rows.raw_observations, rows.weights)
     admitted = admit(rows, batch)
     return admitted, batch, {"batch_fresh": jnp.sum(admitted.weights) / jnp.sum(rows.weights)}
+
+
+def _propose(
+    guide: GuideState,
+    denoiser: Denoiser,
+    critic: Critic,
+    part: Rollout,
+    normaliser: Normaliser,
+    beta: Float[Array, ""],
+    draws: ProposalDraws,
+    *,
+    config: Config,
+    diffusion: DiffusionConfig,
+) -> Proposed:
+    raw = part.observations.reshape(-1, part.observations.shape[-1])
+    visited = Visited(
+        part.state_ids.reshape(-1),
+        raw,
+        normaliser(raw, config.ppo.observation_clip),
+        part.valid.reshape(-1).astype(jnp.float32),
+    )
+    return make_proposals(guide, denoiser, critic, visited, beta, draws, config=config, diffusion=diffusion)
 
 
 def call(name: str, stage: Callable[..., Any], *arguments: Any) -> Any:
@@ -85,63 +130,63 @@ def call(name: str, stage: Callable[..., Any], *arguments: Any) -> Any:
     return stage(*arguments)
 
 
-def update(
+def iterate(
     learner: Learner,
     frozen: Frozen | None,
-    rollout: Rollout,
+    rollout: Iterable[Rollout],
     normaliser: Normaliser,
+    reward_std: Callable[[], Float[Array, ""]],
     schedule: Schedule,
-    key: PRNGKeyArray,
+    draws: Draws,
     stages: Stages,
     run: Callable[..., Any] = call,
 ) -> tuple[Learner, Metrics]:
-    """Steps 2 to 6 of Algorithm 1 on the rollout of step 1. Without a guide it is PPO."""
+    """Algorithm 1, one iteration. Without a guide it is PPO.
+
+    `rollout` yields D_on in parts; `reward_std` is asked for when it is over. Stages are only dispatched here: the next
+    rollout can begin when the actor is there, and what comes after the actor is computed meanwhile.
+    """
     old, guide = learner.ppo, learner.guide
-    keys = [jax.random.fold_in(key, stream) for stream in range(6)]
     settings, weights = schedule.settings, schedule.settings.added_weights
 
-    # 2) Advantages with GAE; rows that are not of the current batch lose their weight.
-    rows, batch, metrics = run("update", stages.advantages, old.critic, rollout, normaliser, schedule.first_id)
+    # 1) Rollout with the current policy; 3) value-guided proposals on the states of each part that has been visited.
+    parts, proposed = [], []
+    for part in rollout:
+        if guide is not None and frozen is not None:
+            given = guide, frozen.denoiser, old.critic, part, normaliser, schedule.beta
+            proposed.append(run("proposals", stages.propose, *given, draws.proposals[len(parts)]))
+        parts.append(part)
 
-    # 3) Value-guided proposals on states of D_on.
+    # 2) Advantages with GAE; rows and proposals that are not of the current batch lose their weight.
+    rows, batch, metrics = run("gae", stages.advantages, old.critic, parts, normaliser, reward_std(), schedule.first_id)
     gated: Any = ()
-    if guide is not None and frozen is not None:
-        gated, q_spread, proposed = run(
-            "proposals",
-            stages.propose,
-            guide,
-            frozen.denoiser,
-            old.critic,
-            on_policy(rows),
-            batch,
-            schedule.beta,
-            keys[1],
-        )
-        metrics |= proposed
+    if guide is not None:
+        gated, q_spread, of_proposals = run("proposals", stages.gate, guide, proposed, batch)
+        metrics |= of_proposals
 
     # 4) The actor (Eq. 9) and V; Q by one-step TD.
     actor, actor_optimizer, improved = run(
-        "update", stages.actor, old.actor, old.actor_optimizer, rows, gated, keys[0], settings
+        "update", stages.actor, old.actor, old.actor_optimizer, rows, gated, draws.actor, settings
     )
+    metrics |= improved | run("audit", stages.policy_metrics, actor, old.actor.log_std, rows)
     critic, critic_optimizer, valued = run(
-        "update", stages.critic, old.critic, old.critic_optimizer, rows, keys[2], settings.learning_rate
+        "update", stages.critic, old.critic, old.critic_optimizer, rows, draws.critic, settings.learning_rate
     )
-    metrics |= improved | valued | run("audit", stages.policy_metrics, actor, old.actor.log_std, rows)
+    metrics |= valued
     if guide is None or frozen is None:
         return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None), metrics
-    q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, on_policy(rows), keys[3])
+    visited = on_policy(rows)
+    q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, visited, draws.q)
 
     # 5) PET: the adapters alone, on D_on.
-    adapters, pet_optimizer, adapted = run(
-        "pet", stages.adapt, guide, frozen.denoiser, on_policy(rows), batch, schedule.pet_steps, keys[4]
-    )
+    given = guide, frozen.denoiser, visited, batch, schedule.pet_steps, draws.pet
+    adapters, pet_optimizer, adapted = run("pet", stages.adapt, *given)
 
     # 6) Monitoring.
-    norm = improved["actor_gradient_norm"]
-    leaked = run("audit", stages.leakage, actor, frozen.probe, normaliser, rows, batch, weights, norm)
-    moved = run(
-        "audit", stages.prior_metrics, actor, frozen.denoiser, guide.adapters, adapters, gated.proposals, keys[5]
-    )
+    given = actor, frozen.probe, normaliser, rows, batch, weights, improved["actor_gradient_norm"]
+    leaked = run("audit", stages.leakage, *given)
+    given = actor, frozen.denoiser, guide.adapters, adapters, gated.proposals, draws.audit
+    moved = run("audit", stages.prior_metrics, *given)
     ppo = PPOState(actor, critic, actor_optimizer, critic_optimizer)
     guide = GuideState(q, q_optimizer, q_spread, adapters, pet_optimizer)
     return Learner(ppo, guide), metrics | learned | adapted | leaked | moved

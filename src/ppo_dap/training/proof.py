@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ppo_dap.config import Config
 from ppo_dap.dap import audit
@@ -14,20 +15,26 @@ from ppo_dap.dap.guide import GuideState
 from ppo_dap.dap.objective import Weights
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import Normaliser, PPOState, Settings
-from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, update
+from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, call, iterate
+from ppo_dap.training.draws import draw, num_parts
 
 
-def prove(learner: Learner, frozen: Frozen | None, config: Config, stages: Stages) -> list[audit.Claim]:
-    """Claims of Definition 1 about the traced update of this learner; nothing is executed."""
+def prove(
+    learner: Learner, frozen: Frozen | None, config: Config, stages: Stages, run: Callable[..., Any] = call
+) -> list[audit.Claim]:
+    """Claims of Definition 1 about the traced update of this learner; nothing is executed.
+
+    `run` is told of every stage as it is traced.
+    """
     sizes = learner.ppo.actor.mlp.layers[0].weight.shape[1], learner.ppo.actor.log_std.shape[0]
     arguments: dict[str, Any] = {
         "actor": learner.ppo.actor,
         "critic": learner.ppo.critic,
         "ppo_optimizers": (learner.ppo.actor_optimizer, learner.ppo.critic_optimizer),
-        "on_policy": example_rollout(config, *sizes),
-        "normaliser": Normaliser(jnp.zeros(sizes[0]), jnp.ones(sizes[0]), jnp.ones(())),
+        "on_policy": (example_rollout(config, *sizes), np.float32(1)),
+        "normaliser": Normaliser(np.zeros(sizes[0], np.float32), np.ones(sizes[0], np.float32)),  # type: ignore[arg-type]
         "schedule": example_schedule(guided=learner.guide is not None),
-        "key": jax.random.key(0),
+        "draws": draw(config, 0, sizes[1], learner.guide is not None),
     }
     if learner.guide is not None and frozen is not None:
         guide = learner.guide
@@ -38,19 +45,22 @@ def prove(learner: Learner, frozen: Frozen | None, config: Config, stages: Stage
             "offline": frozen.probe,
         }
 
-    def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, key, **guided):
+    def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, draws, **guided):
         guide = None
         if guided:
             (q, q_optimizer, spread), (adapters, pet_optimizer) = guided["q"], guided["adapters"]
             guide = GuideState(q, q_optimizer, spread, adapters, pet_optimizer)
-        new, _ = update(
+        rollout, reward_std = on_policy
+        new, _ = iterate(
             Learner(PPOState(actor, critic, *ppo_optimizers), guide),
             Frozen(guided["backbone"], guided["offline"]) if guided else None,
-            on_policy,
+            rollout,
             normaliser,
+            lambda: reward_std,
             schedule,
-            key,
+            draws,
             stages,
+            run,
         )
         ppo, g = new.ppo, new.guide
         results = {"actor": ppo.actor, "critic": ppo.critic, "rest": (ppo.actor_optimizer, ppo.critic_optimizer, g)}
@@ -61,25 +71,20 @@ def prove(learner: Learner, frozen: Frozen | None, config: Config, stages: Stage
     return audit.static_claims(full, traced.flow(sources=("proposals",), cuts=("theta",)))
 
 
-def example_rollout(config: Config, observation_size: int, action_size: int) -> Rollout:
-    """A rollout of zeros, for tracing."""
-    envs = config.ppo.num_envs
-    grid = (config.ppo.rollout_steps // envs, envs)
-    wide = {
-        name: jnp.zeros((*grid, size))
-        for size, names in (
-            (observation_size, ("observations", "next_observations")),
-            (action_size, ("actions", "means")),
-        )
-        for name in names
-    }
-    flags = {name: jnp.zeros(grid, bool) for name in ("terminated", "truncated", "valid")}
-    scalars = {name: jnp.zeros(grid) for name in ("log_probs", "rewards")}
-    return Rollout(state_ids=jnp.zeros(grid, jnp.int32), **wide, **flags, **scalars)
+def example_rollout(config: Config, observation_size: int, action_size: int) -> list[Rollout]:
+    """A rollout of zeros, for tracing; numpy's, as a collector's are."""
+    envs, parts = config.ppo.num_envs, num_parts(config)
+    grid = (config.ppo.rollout_steps // envs // parts, envs)
+    sizes = {"observations": observation_size, "next_observations": observation_size}
+    sizes |= {"actions": action_size, "means": action_size}
+    wide = {name: np.zeros((*grid, size), np.float32) for name, size in sizes.items()}
+    flags = {name: np.zeros(grid, bool) for name in ("terminated", "truncated", "valid")}
+    scalars = {name: np.zeros(grid, np.float32) for name in ("log_probs", "rewards")}
+    return [Rollout(state_ids=np.zeros(grid, np.int32), **wide, **flags, **scalars)] * parts  # type: ignore[arg-type]
 
 
 def example_schedule(guided: bool) -> Schedule:
     """A schedule of zeros, for tracing."""
-    zero = jnp.zeros(())
+    zero, none = jnp.asarray(np.float32(0)), jnp.asarray(np.int32(0))
     settings = Settings(zero, zero, jnp.asarray(guided), Weights(zero, zero) if guided else ())
-    return Schedule(jnp.zeros((), jnp.int32), settings, zero, jnp.zeros((), jnp.int32))
+    return Schedule(none, settings, zero, none)

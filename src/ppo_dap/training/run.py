@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,6 +22,7 @@ from ppo_dap.nets.policy import Policy, load_policy
 from ppo_dap.priors import DiffusionPrior, load_prior
 from ppo_dap.storage import write_atomically
 from ppo_dap.tasks import TaskSpec, describe
+from ppo_dap.training.ahead import CompileAhead
 from ppo_dap.training.algorithm import Frozen, Stages, create_learner
 from ppo_dap.training.manifest import manifest
 from ppo_dap.training.proof import prove
@@ -150,8 +150,7 @@ def _make_trainer(
         frozen = Frozen(
             prior.denoiser, audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions))
         )
-    create = jax.jit(partial(create_learner, sizes=sizes, config=config))  # one program, not hundreds of small ones
-    learner = create(jax.random.key(config.run.seed), denoiser=None if frozen is None else frozen.denoiser)
+    learner = create_learner(sizes, config, None if frozen is None else frozen.denoiser)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
     lines = None
     checkpoint = folder / "checkpoints" / "last.safetensors"
@@ -161,13 +160,16 @@ def _make_trainer(
     elif logs is not None:
         state = warm_start(state, logs, spec, config)
     stages = Stages(config, diffusion)
-    claims = prove(learner, frozen, config, stages)
+    ahead = CompileAhead()
+    claims = prove(learner, frozen, config, stages, ahead.trace)
     if lines is None:
         write_atomically(folder / "config.json", json.dumps(description | manifest(), indent=1).encode())
     recorder = Recorder(folder, config.run.tensorboard, lines)
     label = f"{spec.task} {description['method']} seed {config.run.seed}"
     bar = make_progress(label, config.run.steps, state.env_steps, show)
-    return Trainer(config, spec, state, frozen, stages, folder, {"task": spec.task}, claims, recorder, bar)
+    return Trainer(
+        config, spec, state, frozen, stages, folder, {"task": spec.task}, claims, recorder, bar, before_first=ahead.wait
+    )
 
 
 def _check_prior(method: Method, prior: Any, spec: TaskSpec) -> DiffusionPrior | None:

@@ -33,7 +33,7 @@ class TrainState:
         """The current policy in numpy, with the statistics as they are now."""
         actor = self.learner.ppo.actor
         return Policy(
-            tuple(np.asarray(layer.weight) for layer in actor.mlp.layers),
+            tuple(np.asfortranarray(layer.weight) for layer in actor.mlp.layers),  # so that .T is contiguous
             tuple(np.asarray(layer.bias) for layer in actor.mlp.layers),
             np.asarray(actor.log_std),
             self.observations.mean.astype(np.float32),

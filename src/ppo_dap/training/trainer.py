@@ -7,11 +7,11 @@ import json
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +23,15 @@ from ppo_dap.dap.adaptation import steps_until
 from ppo_dap.dap.guidance import beta_schedule
 from ppo_dap.dap.objective import Weights
 from ppo_dap.errors import TrainingDiverged
+from ppo_dap.nets.policy import Policy
 from ppo_dap.ppo.rollout import Collector, Rollout
 from ppo_dap.ppo.update import Normaliser, Settings
 from ppo_dap.storage import write_atomically
 from ppo_dap.tasks import TaskSpec, make_vector_env
-from ppo_dap.training.algorithm import Frozen, Schedule, Stages, update
+from ppo_dap.training.algorithm import Frozen, Schedule, Stages, iterate
+from ppo_dap.training.clock import Clock
+from ppo_dap.training.cores import pinned
+from ppo_dap.training.draws import Draws, draw, num_parts
 from ppo_dap.training.evaluation import evaluate_policy
 from ppo_dap.training.recording import Progress, Recorder
 from ppo_dap.training.state import TrainState, save_checkpoint
@@ -38,18 +42,14 @@ EXPLODED = 1e8
 ROLLOUT_STREAM, ENV_STREAM, EVALUATION_STREAM = 0, 1, 2
 
 
-class Stopwatch:
-    """Times the stages of an iteration by name; waits for each, so that its time is its own."""
+class Pending(NamedTuple):
+    """An iteration whose metrics the device may still be computing."""
 
-    def __init__(self):
-        self.seconds: dict[str, float] = {}
-
-    def __call__(self, name: str, function: Any, *arguments: Any) -> Any:
-        """Call `function` and add the time it took to `name`."""
-        start = time.perf_counter()
-        result = jax.block_until_ready(function(*arguments))
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-        return result
+    row: dict[str, Any]
+    metrics: dict[str, Any]
+    seconds: Callable[[], Mapping[str, float]]
+    """Gives the seconds of its stages, once they are done."""
+    total: float
 
 
 @dataclass
@@ -67,21 +67,32 @@ class Trainer:
     static_claims: list[audit.Claim]
     recorder: Recorder
     progress: Progress
+    before_first: Callable[[], None] = lambda: None
+    """Called before the first iteration: waits until the stages are compiled."""
+    clock: Clock = field(default_factory=Clock, init=False)
     interrupted: bool = field(default=False, init=False)
+    _pending: Pending | None = field(default=None, init=False)
+    _next_draws: tuple[int, Draws] | None = field(default=None, init=False)
+    _recorded_steps: int = field(init=False)
     _last_return: float | None = field(default=None, init=False)
+
+    def __post_init__(self):
+        self._recorded_steps = self.state.env_steps
 
     def run(self) -> None:
         """Train until the budget is spent, or until Ctrl-C; the last checkpoint holds the end either way."""
         self._write_audit()
         try:
-            with self._deferred_interrupt():
+            with self._deferred_interrupt(), pinned(self.config.run.pin_core and self.config.run.threads == 1):
                 if self.state.iteration == 0:
                     self.evaluate()
+                self.before_first()
                 while self.state.env_steps < self.config.run.steps and not self.interrupted:
                     self._segment()
                     self.checkpoint("last")
-            self.state.policy(self.spec, self.config.ppo.observation_clip).save(self.folder / "policy.safetensors")
+            self._policy().save(self.folder / "policy.safetensors")
         finally:
+            self.clock.close()
             self.recorder.close()
             self.progress.close()
 
@@ -108,42 +119,73 @@ class Trainer:
             env.close()
 
     def iterate(self, collector: Collector) -> None:
-        """One iteration of Algorithm 1 and its line in the metrics."""
-        state, config, ppo = self.state, self.config, self.config.ppo
-        clock, start = Stopwatch(), time.perf_counter()
-        # 1) Rollout with the current policy and frozen statistics.
-        rollout = self._collect(collector, clock)
-        valid, ended = np.asarray(rollout.valid), np.asarray(rollout.terminated | rollout.truncated)
-        state.reward_scale = state.reward_scale.update(np.asarray(rollout.rewards), ended, valid, ppo.gamma)
-        # 2) to 6)
-        key = jax.random.fold_in(jax.random.key(config.run.seed), state.iteration)
-        state.learner, device_metrics = update(
-            state.learner, self.frozen, rollout, self._normaliser(), self.schedule(), key, self.stages, clock
+        """One iteration of Algorithm 1. Returns when the actor is there; the last iteration's metrics are recorded."""
+        state, config, start = self.state, self.config, time.perf_counter()
+        parts: list[Rollout] = []
+        state.learner, metrics = iterate(
+            state.learner,
+            self.frozen,
+            self._collect(collector, parts),
+            Normaliser(_f32(state.observations.mean), _f32(state.observations.std)),
+            lambda: self._reward_std(parts),
+            self.schedule(),
+            self._draws(state.iteration),
+            self.stages,
+            self.clock.dispatch,
         )
-        metrics = {name: float(value) for name, value in device_metrics.items()}
-        self._guard(metrics)
-        state.observations = state.observations.update(np.asarray(rollout.observations)[valid])
-        state.iteration += 1
-        state.env_steps += int(valid.sum())
-        self._apply_kl_rule(metrics["policy_kl"])
-        self._record(metrics, collector, int(valid.sum()), clock.seconds, time.perf_counter() - start)
+        # The host does its own work while the device works on the actor.
+        with self.clock.host("host"):
+            valid = np.concatenate([part.valid for part in parts])
+            state.observations = state.observations.update(np.concatenate([p.observations for p in parts])[valid])
+            row: dict[str, Any] = {"env_steps": state.env_steps + int(valid.sum()), "iteration": state.iteration + 1}
+            row["return_train"] = float(np.mean(r)) if (r := collector.finished_returns) else None
+            collector.finished_returns = []
+            self._next_draws = state.iteration + 1, self._draws(state.iteration + 1)
+        with self.clock.host("recording"):
+            self.settle()
+        state.iteration, state.env_steps = row["iteration"], row["env_steps"]
+        with self.clock.host("waiting"):
+            jax.block_until_ready(state.learner.ppo.actor)
+        if config.ppo.kl_rule == "reduce_lr":
+            self._reduce_lr(float(metrics["policy_kl"]))
+        self._pending = Pending(row, metrics, self.clock.turn(), time.perf_counter() - start)
 
-    def _collect(self, collector: Collector, clock: Stopwatch) -> Rollout:
+    def _collect(self, collector: Collector, parts: list[Rollout]) -> Iterator[Rollout]:
+        """The rollout, part by part; `parts` keeps them."""
         state, config = self.state, self.config
-        policy = state.policy(self.spec, config.ppo.observation_clip)
+        policy = self._policy()
         rng = np.random.default_rng([config.run.seed, ROLLOUT_STREAM, state.iteration])
-        rollout = clock("rollout", collector.collect, policy, config.ppo.rollout_steps, state.iteration, rng)
-        clock.seconds["env"] = collector.env_seconds
-        clock.seconds["policy"] = clock.seconds.pop("rollout") - collector.env_seconds
-        return rollout
+        steps, count = config.ppo.rollout_steps, num_parts(config)
+        rollout = collector.collect(policy, steps, count, state.iteration, rng)
+        while True:
+            with self.clock.host("rollout"):
+                part = next(rollout, None)
+            if part is None:
+                break
+            parts.append(part)
+            yield part
+        self.clock.add("env", collector.env_seconds)
 
-    def _normaliser(self) -> Normaliser:
-        state = self.state
-        return Normaliser(
-            jnp.asarray(state.observations.mean, jnp.float32),
-            jnp.asarray(state.observations.std, jnp.float32),
-            jnp.asarray(state.reward_scale.std, jnp.float32),
+    def _policy(self) -> Policy:
+        policy = self.state.policy(self.spec, self.config.ppo.observation_clip)
+        if not all(np.isfinite(array).all() for array in (*policy.weights, *policy.biases, policy.log_std)):
+            self.settle()  # names the loss that did it
+            raise TrainingDiverged(f"iteration {self.state.iteration}: the policy is not finite; {self._kept()}")
+        return policy
+
+    def _draws(self, iteration: int) -> Draws:
+        if self._next_draws is not None and self._next_draws[0] == iteration:
+            return self._next_draws[1]
+        return draw(self.config, iteration, self.spec.action_size, self.frozen is not None)
+
+    def _reward_std(self, parts: list[Rollout]) -> jax.Array:
+        """What this rollout's rewards are divided by: the running scale with the rollout itself in it."""
+        rewards, ended, valid = (
+            np.concatenate(x)
+            for x in zip(*((p.rewards, p.terminated | p.truncated, p.valid) for p in parts), strict=True)
         )
+        self.state.reward_scale = self.state.reward_scale.update(rewards, ended, valid, self.config.ppo.gamma)
+        return _f32(self.state.reward_scale.std)
 
     def schedule(self) -> Schedule:
         """What the run's progress sets for the next iteration."""
@@ -164,37 +206,44 @@ class Trainer:
             jnp.asarray(pet[1] - pet[0], jnp.int32),
         )
 
-    def _apply_kl_rule(self, policy_kl: float) -> None:
-        if self.config.ppo.kl_rule == "reduce_lr":
-            scale, target = self.state.learning_rate_scale, self.config.ppo.kl_target
-            if policy_kl > target:
-                self.state.learning_rate_scale = scale / 2
-            elif policy_kl < target / 2:
-                self.state.learning_rate_scale = min(1.0, scale * 2)
+    def _reduce_lr(self, policy_kl: float) -> None:
+        scale, target = self.state.learning_rate_scale, self.config.ppo.kl_target
+        if policy_kl > target:
+            self.state.learning_rate_scale = scale / 2
+        elif policy_kl < target / 2:
+            self.state.learning_rate_scale = min(1.0, scale * 2)
 
-    def _guard(self, metrics: dict[str, float]) -> None:
-        """Stop a run whose losses are not numbers any more, before anything of it is saved."""
+    def settle(self) -> None:
+        """Record the iteration that is pending, if one is. Raises `TrainingDiverged` if its losses are no numbers."""
+        if self._pending is None:
+            return
+        (row, metrics, seconds, total), self._pending = self._pending, None
+        metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
         for name in LOSSES:
             if name in metrics and not abs(metrics[name]) < EXPLODED:
-                last = self.folder / "checkpoints" / "last.safetensors"
-                kept = f"the last good checkpoint is {last}" if last.is_file() else "there is no checkpoint yet"
-                raise TrainingDiverged(f"iteration {self.state.iteration}: {name} is {metrics[name]:g}; {kept}")
-
-    def _record(self, metrics: dict, collector: Collector, steps: int, seconds: dict, total: float) -> None:
-        finished, collector.finished_returns = collector.finished_returns, []
-        mean = float(np.mean(finished)) if finished else None
-        self._last_return = mean if mean is not None else self._last_return
-        schedule_free = {"env_steps": self.state.env_steps, "iteration": self.state.iteration, "return_train": mean}
-        timing = {"steps_per_second": steps / total} | {f"seconds_{k}": v for k, v in seconds.items()}
-        self.recorder.add("metrics", schedule_free | metrics | timing)
-        self.progress.update(
-            self.state.env_steps, {"return": self._last_return, "steps_per_second": timing["steps_per_second"]}
+                raise TrainingDiverged(f"iteration {row['iteration'] - 1}: {name} is {metrics[name]:g}; {self._kept()}")
+        steps, self._recorded_steps = row["env_steps"] - self._recorded_steps, row["env_steps"]
+        timing = dict(seconds())
+        timing["policy"] = timing.pop("rollout") - timing["env"]
+        speed = steps / total
+        self.recorder.add(
+            "metrics",
+            row
+            | metrics
+            | {"steps_per_second": speed, "seconds_iteration": total}
+            | {f"seconds_{name}": value for name, value in timing.items()},
         )
+        self._last_return = self._last_return if row["return_train"] is None else row["return_train"]
+        self.progress.update(row["env_steps"], {"return": self._last_return, "steps_per_second": speed})
+
+    def _kept(self) -> str:
+        last = self.folder / "checkpoints" / "last.safetensors"
+        return f"the last good checkpoint is {last}" if last.is_file() else "there is no checkpoint yet"
 
     def evaluate(self) -> None:
         """Evaluate the deterministic policy with frozen statistics; keep the best one's checkpoint."""
-        config, state = self.config.run, self.state
-        policy = state.policy(self.spec, self.config.ppo.observation_clip)
+        self.settle()
+        config, state, policy = self.config.run, self.state, self._policy()
         seed = _seed(config.seed, EVALUATION_STREAM, state.env_steps // max(config.eval_every, 1))
         result = evaluate_policy(policy, self.spec.task, config.eval_episodes, seed, config.threads)
         row = result.row(state.env_steps)
@@ -205,14 +254,13 @@ class Trainer:
 
     def checkpoint(self, name: str) -> None:
         """Write the state atomically; on failure the file of that name is what it was."""
+        self.settle()
         path = self.folder / "checkpoints" / f"{name}.safetensors"
         run = self.identity | {"lines": self.recorder.counts}
         try:
             save_checkpoint(path, self.state, run)
         except OSError as error:
-            last = self.folder / "checkpoints" / "last.safetensors"
-            kept = f"the last good checkpoint is {last}" if last.is_file() else "there is no checkpoint yet"
-            raise OSError(f"checkpoint {path} could not be written ({error.strerror}); {kept}") from error
+            raise OSError(f"checkpoint {path} could not be written ({error.strerror}); {self._kept()}") from error
 
     def _write_audit(self) -> None:
         """What was proved about the update; what is measured is in the metrics."""
@@ -238,7 +286,7 @@ class Trainer:
             signal.signal(signal.SIGINT, previous)
 
 
-def _f32(value: float) -> jax.Array:
+def _f32(value: float | np.ndarray) -> jax.Array:
     return jnp.asarray(value, jnp.float32)
 
 

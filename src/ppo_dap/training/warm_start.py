@@ -22,6 +22,7 @@ from ppo_dap.nets.policy import scale_actions
 from ppo_dap.tasks import TaskSpec
 from ppo_dap.training.state import TrainState
 
+WARM_START_STREAM = 6
 BATCH = 256
 PATIENCE = 3
 """Passes without a better held-out loss before a fit ends."""
@@ -95,9 +96,7 @@ def _fit(model: Any, loss: Callable[..., Any], train: dict, held_out: dict, conf
     size = min(BATCH, count)
 
     @jax.jit
-    def epoch(model, state, key):
-        order = jax.random.permutation(key, count)[: count // size * size].reshape(-1, size)
-
+    def epoch(model, state, order):
         def step(carry, index):
             model, state = carry
             gradient = jax.grad(loss)(model, {name: x[index] for name, x in train.items()})
@@ -108,8 +107,10 @@ def _fit(model: Any, loss: Callable[..., Any], train: dict, held_out: dict, conf
         return model, state, loss(model, held_out)
 
     best, best_loss, waited, state = model, np.inf, 0, optimizer.init(model)
-    for key in jax.random.split(jax.random.key(config.run.seed), config.warm.warm_start_epochs):
-        model, state, value = epoch(model, state, key)
+    rng = np.random.default_rng([config.run.seed, WARM_START_STREAM])
+    for _ in range(config.warm.warm_start_epochs):
+        order = rng.permutation(count)[: count // size * size].reshape(-1, size)
+        model, state, value = epoch(model, state, order)
         waited = 0 if value < best_loss else waited + 1
         if value < best_loss:
             best, best_loss = model, float(value)

@@ -1,0 +1,64 @@
+"""All random numbers of an iteration's update, drawn on the host: functions of (seed, iteration) and nothing else.
+
+Jitted stages are deterministic functions of arrays. numpy draws normal numbers five times as fast as XLA does on a CPU,
+in the time that the host would spend waiting for the actor.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from ppo_dap.config import Config
+from ppo_dap.dap.adaptation import PETDraws
+from ppo_dap.dap.audit import PROXY_STATES
+from ppo_dap.dap.guide import num_proposal_states
+from ppo_dap.dap.proposals import ProposalDraws, solver
+from ppo_dap.ppo.update import Orders, draw_orders
+
+PARTS = 8
+"""Most parts of a rollout: proposals on each are computed while the next is collected."""
+PPO_STREAM, GUIDE_STREAM = 3, 4
+
+
+class Draws(NamedTuple):
+    """Random numbers of one iteration; those of the guide are empty for plain PPO."""
+
+    actor: Orders
+    critic: Int[np.ndarray, "epochs rows"]
+    proposals: tuple[ProposalDraws, ...] = ()
+    q: Any = ()
+    pet: Any = ()
+    audit: Any = ()
+
+
+def num_parts(config: Config) -> int:
+    """Parts into which a rollout is cut, all of one length."""
+    return math.gcd(PARTS, config.ppo.rollout_steps // config.ppo.num_envs)
+
+
+def draw(config: Config, iteration: int, action_size: int, guided: bool) -> Draws:
+    """The draws of an iteration. PPO's have a stream of their own: a guide does not change them."""
+    ppo, rows = config.ppo, config.ppo.rollout_steps
+    rng = np.random.default_rng([config.run.seed, PPO_STREAM, iteration])
+    actor, critic = (draw_orders(rng, ppo.num_epochs, rows) for _ in range(2))
+    if not guided:
+        return Draws(Orders(actor, np.zeros((ppo.num_epochs, 0), np.int32)), critic)  # type: ignore[arg-type]
+    rng = np.random.default_rng([config.run.seed, GUIDE_STREAM, iteration])
+    parts = num_parts(config)
+    states = num_proposal_states(rows, parts, config)
+    few, k = min(PROXY_STATES, states), config.proposals.num_proposals
+    updates = ppo.num_epochs * rows // ppo.minibatch_size
+    return Draws(
+        Orders(actor, draw_orders(rng, ppo.num_epochs, states)),  # type: ignore[arg-type]
+        critic,
+        tuple(
+            ProposalDraws.make(rng, rows // parts, states // parts, action_size, config.proposals) for _ in range(parts)
+        ),
+        draw_orders(rng, config.q.q_epochs, rows),
+        PETDraws.make(rng, action_size, updates, config.adaptation),
+        rng.standard_normal(solver(config.proposals).noise_shape(few, k, action_size), dtype=np.float32),
+    )
