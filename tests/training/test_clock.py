@@ -123,3 +123,14 @@ def test_a_profile_by_hand():
 
 def test_a_run_of_one_iteration_has_no_profile():
     assert profile([]) == profile([row(5.0, env=1.0)]) == []
+
+
+def test_a_stage_that_fails_on_the_device_leaves_nobody_waiting(clock):
+    class Failing:
+        def block_until_ready(self):
+            raise RuntimeError("the device is gone")
+
+    clock.dispatch("a", Failing)
+    assert clock.turn()().keys() == {"a"}
+    clock.dispatch("b", Promise, 0.0)
+    assert clock.turn()().keys() == {"b"}

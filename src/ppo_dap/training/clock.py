@@ -6,7 +6,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 import jax
@@ -113,6 +113,7 @@ class Clock:
                 item.set()
                 continue
             name, start, result, seconds = item
-            result.block_until_ready()
+            with suppress(Exception):  # whoever reads the result is told; here it must not leave `turn` waiting
+                result.block_until_ready()
             start, ready = max(start, ready), time.perf_counter()
             seconds[name] = seconds.get(name, 0.0) + ready - start
