@@ -156,7 +156,7 @@ class DiffusionPrior:
         config = DiffusionConfig(**header["config"])
         sizes = (header["observation_size"],), (header["observation_size"],), ()
         blank = jax.eval_shape(
-            lambda *moments: Denoiser.create(np.random.default_rng(0), config, *moments, header["action_size"]),
+            lambda *m: Denoiser.create(np.random.default_rng(0), config, m[0], m[1], m[2], header["action_size"]),
             *(jax.ShapeDtypeStruct(size, jnp.float32) for size in sizes),
         )
         missing = [name for name in _ARRAYS if name not in tensors]
