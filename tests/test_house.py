@@ -176,7 +176,7 @@ def test_no_machine_paths():
 def test_a_machine_path_is_found(tmp_path, folder, name):
     file = tmp_path / name
     file.parent.mkdir(exist_ok=True)
-    file.write_text("fine: a/work/b, https://host/tmp/x, /tmp\n")
+    file.write_text(f"fine: a/{folder}/b, https://host/{folder}/x, /{folder}\n")
     assert machine_paths(tmp_path) == []
     file.write_text(f"one\nopen('/{folder}/somebody/file')\n")
     assert machine_paths(tmp_path) == [f"{name}:2"]

@@ -4,17 +4,15 @@ CleanRL is files to copy, not a package: this is the structure of its continuous
 iteration (collect and update) is a warm-up outside the clock; the rest of ``--steps`` is timed.
 """
 
-import argparse
-import json
 import time
 
 import gymnasium as gym
 import numpy as np
 import torch
+from common import ENVS, ITERATION, ROLLOUT, arguments, report
 from torch import nn
 from torch.distributions import Normal
 
-ENVS, ROLLOUT, ITERATION = 8, 256, 8 * 256  # environments, and steps of each and of all in an iteration
 EPOCHS, MINIBATCH, GAMMA, LAMBDA, CLIP = 10, 256, 0.99, 0.95, 0.2
 
 
@@ -87,20 +85,11 @@ def train(task: str, iterations: int) -> float:
 
 def main() -> None:
     """Train, and print the measurement as one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", default="Walker2d-v5")
-    parser.add_argument("--steps", type=int, default=20480, help="environment steps, the warm-up's 2048 included")
-    parser.add_argument("--threads", type=int, help="torch.set_num_threads; torch's own default when left out")
-    args = parser.parse_args()
-    if args.steps % ITERATION or args.steps < 2 * ITERATION:
-        parser.error(f"--steps must be a multiple of {ITERATION}, and at least twice that")
-    if args.threads:
-        torch.set_num_threads(args.threads)
+    args = arguments(__doc__)
 
     seconds, steps = train(args.task, args.steps // ITERATION), args.steps - ITERATION
 
-    result = {"peer": "cleanrl", "version": f"anew, torch {torch.__version__}", "task": args.task, "steps": steps}
-    print(json.dumps({**result, "seconds": round(seconds, 3), "steps_per_second": round(steps / seconds, 1)}))
+    report("cleanrl", f"anew, torch {torch.__version__}", args.task, steps, seconds)
 
 
 if __name__ == "__main__":

@@ -3,31 +3,20 @@
 The first iteration (collect and update) is a warm-up outside the clock; the rest of ``--steps`` is timed.
 """
 
-import argparse
-import json
 import time
 from importlib.metadata import version
 
 import gymnasium as gym
 import torch
+from common import ENVS, ITERATION, ROLLOUT, arguments, report
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-ENVS, ROLLOUT, ITERATION = 8, 256, 8 * 256  # environments, and steps of each and of all in an iteration
-
 
 def main() -> None:
     """Train, and print the measurement as one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", default="Walker2d-v5")
-    parser.add_argument("--steps", type=int, default=20480, help="environment steps, the warm-up's 2048 included")
-    parser.add_argument("--threads", type=int, help="torch.set_num_threads; torch's own default when left out")
-    args = parser.parse_args()
-    if args.steps % ITERATION or args.steps < 2 * ITERATION:
-        parser.error(f"--steps must be a multiple of {ITERATION}, and at least twice that")
-    if args.threads:
-        torch.set_num_threads(args.threads)
+    args = arguments(__doc__)
 
     envs = VecNormalize(DummyVecEnv([lambda: gym.make(args.task)] * ENVS), gamma=0.99)
     model = PPO(
@@ -56,8 +45,7 @@ def main() -> None:
     seconds = time.perf_counter() - start
     steps = model.num_timesteps - steps_before
 
-    result = {"peer": "sb3", "version": version("stable-baselines3"), "task": args.task, "steps": steps}
-    print(json.dumps({**result, "seconds": round(seconds, 3), "steps_per_second": round(steps / seconds, 1)}))
+    report("sb3", version("stable-baselines3"), args.task, steps, seconds)
 
 
 if __name__ == "__main__":

@@ -4,33 +4,21 @@ The first iteration (collect and update, with the compilation) is a warm-up outs
 ``--steps`` is timed.
 """
 
-import argparse
-import json
 import time
 from importlib.metadata import version
 
 import gymnasium as gym
 import jax
-import torch
+from common import ENVS, ITERATION, ROLLOUT, arguments, report
 from flax import linen as nn
 from sbx import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-ENVS, ROLLOUT, ITERATION = 8, 256, 8 * 256  # environments, and steps of each and of all in an iteration
-
 
 def main() -> None:
     """Train, and print the measurement as one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", default="Walker2d-v5")
-    parser.add_argument("--steps", type=int, default=20480, help="environment steps, the warm-up's 2048 included")
-    parser.add_argument("--threads", type=int, help="torch.set_num_threads: SBX's rollout buffer only, not JAX")
-    args = parser.parse_args()
-    if args.steps % ITERATION or args.steps < 2 * ITERATION:
-        parser.error(f"--steps must be a multiple of {ITERATION}, and at least twice that")
-    if args.threads:
-        torch.set_num_threads(args.threads)
+    args = arguments(__doc__)
     jax.config.update("jax_platforms", "cpu")
 
     envs = VecNormalize(DummyVecEnv([lambda: gym.make(args.task)] * ENVS), gamma=0.99)
@@ -61,8 +49,7 @@ def main() -> None:
     seconds = time.perf_counter() - start
     steps = model.num_timesteps - steps_before
 
-    result = {"peer": "sbx", "version": version("sbx-rl"), "task": args.task, "steps": steps}
-    print(json.dumps({**result, "seconds": round(seconds, 3), "steps_per_second": round(steps / seconds, 1)}))
+    report("sbx", version("sbx-rl"), args.task, steps, seconds)
 
 
 if __name__ == "__main__":

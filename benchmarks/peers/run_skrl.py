@@ -3,14 +3,13 @@
 The first iteration (collect and update) is a warm-up outside the clock; the rest of ``--steps`` is timed.
 """
 
-import argparse
-import json
 import time
 from importlib.metadata import version
 
 import gymnasium as gym
 import skrl
 import torch
+from common import ENVS, ITERATION, ROLLOUT, arguments, report
 from skrl.agents.torch import ExperimentCfg
 from skrl.agents.torch.ppo import PPO, PPO_CFG
 from skrl.envs.wrappers.torch import wrap_env
@@ -19,8 +18,6 @@ from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 from skrl.resources.preprocessors.torch import RunningStandardScaler
 from skrl.trainers.torch import SequentialTrainer, SequentialTrainerCfg
 from torch import nn
-
-ENVS, ROLLOUT, ITERATION = 8, 256, 8 * 256  # environments, and steps of each and of all in an iteration
 
 
 def mlp(inputs: int, outputs: int) -> nn.Sequential:
@@ -57,15 +54,7 @@ class Value(DeterministicMixin, Model):
 
 def main() -> None:
     """Train, and print the measurement as one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", default="Walker2d-v5")
-    parser.add_argument("--steps", type=int, default=20480, help="environment steps, the warm-up's 2048 included")
-    parser.add_argument("--threads", type=int, help="torch.set_num_threads; torch's own default when left out")
-    args = parser.parse_args()
-    if args.steps % ITERATION or args.steps < 2 * ITERATION:
-        parser.error(f"--steps must be a multiple of {ITERATION}, and at least twice that")
-    if args.threads:
-        torch.set_num_threads(args.threads)
+    args = arguments(__doc__)
     skrl.config.torch.device = "cpu"
 
     # A reset within the step: every step that is counted is then one of the simulator.
@@ -101,8 +90,7 @@ def main() -> None:
     trainer.train()
     seconds, steps = time.perf_counter() - start, trainer.cfg.timesteps * ENVS
 
-    result = {"peer": "skrl", "version": version("skrl"), "task": args.task, "steps": steps}
-    print(json.dumps({**result, "seconds": round(seconds, 3), "steps_per_second": round(steps / seconds, 1)}))
+    report("skrl", version("skrl"), args.task, steps, seconds)
 
 
 if __name__ == "__main__":

@@ -3,12 +3,11 @@
 The first iteration (collect and update) is a warm-up outside the clock; the rest of ``--steps`` is timed.
 """
 
-import argparse
-import json
 import time
 from importlib.metadata import version
 
 import torch
+from common import ENVS, ITERATION, arguments, report
 from tianshou.algorithm import PPO
 from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
 from tianshou.algorithm.optim import AdamOptimizerFactory
@@ -20,8 +19,6 @@ from tianshou.utils.net.common import Net
 from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
 from torch.distributions import Distribution, Independent, Normal
 
-ENVS, ROLLOUT, ITERATION = 8, 256, 8 * 256  # environments, and steps of each and of all in an iteration
-
 
 def gaussian(loc_scale: tuple[torch.Tensor, torch.Tensor]) -> Distribution:
     """Return the policy's distribution: a diagonal Gaussian."""
@@ -30,16 +27,7 @@ def gaussian(loc_scale: tuple[torch.Tensor, torch.Tensor]) -> Distribution:
 
 def main() -> None:
     """Train, and print the measurement as one JSON line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", default="Walker2d-v5")
-    parser.add_argument("--steps", type=int, default=20480, help="environment steps, the warm-up's 2048 included")
-    parser.add_argument("--threads", type=int, help="torch.set_num_threads; torch's own default when left out")
-    parser.add_argument("--dummy", action="store_true", help="DummyVectorEnv in place of envpool")
-    args = parser.parse_args()
-    if args.steps % ITERATION or args.steps < 2 * ITERATION:
-        parser.error(f"--steps must be a multiple of {ITERATION}, and at least twice that")
-    if args.threads:
-        torch.set_num_threads(args.threads)
+    args = arguments(__doc__, ("--dummy", "DummyVectorEnv in place of envpool"))
 
     # Tianshou's envpool integration works here, through its own EnvPoolFactory, and costs no more than DummyVectorEnv.
     # (The "envpool" extra of Tianshou 2.0 still asks for envpool below 0.9; envpool 1.2 is what this was tried with.)
@@ -93,8 +81,7 @@ def main() -> None:
     seconds = time.perf_counter() - start
     steps = collector.collect_step - steps_before
 
-    result = {"peer": "tianshou", "version": version("tianshou"), "task": args.task, "steps": steps}
-    print(json.dumps({**result, "seconds": round(seconds, 3), "steps_per_second": round(steps / seconds, 1)}))
+    report("tianshou", version("tianshou"), args.task, steps, seconds)
 
 
 if __name__ == "__main__":

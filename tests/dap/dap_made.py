@@ -157,3 +157,32 @@ def quick_stages(config):
         if name not in ("actor", "critic"):
             setattr(stages, name, quick_jit(stage.__wrapped__))
     return stages
+
+
+def logged(rows, probe):
+    """`rows` whose first 16 are rows of the logs, under ids of D_on."""
+    n = len(probe.actions)
+    observations = rows.raw_observations.at[:n].set(probe.raw_observations)
+    actions = rows.actions.at[:n].set(probe.actions)
+    return changed(rows, raw_observations=observations, observations=observations, actions=actions)
+
+
+def replaced(arguments, position, value):
+    return *arguments[:position], value, *arguments[position + 1 :]
+
+
+def tamper(stage_name, edit):
+    """A fault that edits the arguments of one stage: `edit(arguments, seen, frozen)` returns the new ones."""
+
+    def fault(name, stage, arguments, seen, frozen):
+        return stage(*(edit(arguments, seen, frozen) if name == stage_name else arguments))
+
+    return fault
+
+
+def logged_rows_for(position):
+    return lambda arguments, seen, frozen: replaced(arguments, position, logged(arguments[position], frozen.probe))
+
+
+def violated(claims):
+    return {claim.statement for claim in claims if not claim.holds}

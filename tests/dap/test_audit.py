@@ -1,15 +1,13 @@
-"""Definition 1's audits: every claim holds on the update as it is, and each planted fault fires the claim it breaks."""
+"""What every iteration measures of Definition 1, the faults that show in it, and the verdict on what was logged."""
 
 import copy
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dap.dap_made import (
     ACT,
-    DIFFUSION,
     NORMALISER,
     OBS,
     REWARD_STD,
@@ -17,204 +15,23 @@ from dap.dap_made import (
     changed,
     iterated,
     learner_of,
+    logged_rows_for,
     parts_of,
     quick_stages,
     rollout_of,
     schedule_of,
     small_config,
+    tamper,
+    violated,
     with_fault,
 )
 from ppo_dap.dap import audit, guide, objective
-from ppo_dap.dap.dataflow import Flow
-from ppo_dap.dap.objective import proposal_terms
-from ppo_dap.training import proof
-from ppo_dap.training.algorithm import Stages, iterate
+from ppo_dap.training.algorithm import iterate
 from ppo_dap.training.draws import draw
 
-RATIO, ADVANTAGES, V, PET, POLICY, REST = [row[1] for row in audit.FORBIDDEN]
 FRESH = "every row of the actor update is of the current batch (share)"
 RATIO_1 = "ratio is 1 at the first minibatch (largest error)"
 SPR, PET_SPR, OGLR = "SPR, smallest", "share of PET rows from the current batch, smallest", "OGLR, largest"
-
-
-def logged(rows, probe):
-    """`rows` whose first 16 are rows of the logs, under ids of D_on."""
-    n = len(probe.actions)
-    observations = rows.raw_observations.at[:n].set(probe.raw_observations)
-    actions = rows.actions.at[:n].set(probe.actions)
-    return changed(rows, raw_observations=observations, observations=observations, actions=actions)
-
-
-def replaced(arguments, position, value):
-    return *arguments[:position], value, *arguments[position + 1 :]
-
-
-def tamper(stage_name, edit):
-    """A fault that edits the arguments of one stage: `edit(arguments, seen, frozen)` returns the new ones."""
-
-    def fault(name, stage, arguments, seen, frozen):
-        return stage(*(edit(arguments, seen, frozen) if name == stage_name else arguments))
-
-    return fault
-
-
-def proposals_of(seen):
-    return seen["gate"][1][0].proposals
-
-
-def offline_rows_in_the_actor_loss(arguments, seen, frozen):
-    return replaced(arguments, 2, logged(arguments[2], frozen.probe))
-
-
-def offline_rows_among_the_proposals(arguments, seen, frozen):
-    gated = arguments[3]
-    proposals = changed(gated.proposals, actions=gated.proposals.actions.at[:, 0].set(frozen.probe.actions))
-    return replaced(arguments, 3, changed(gated, proposals=proposals))
-
-
-def proposals_in_the_ratio(arguments, seen, frozen):
-    actions = proposals_of(seen).actions[:, 0]
-    return replaced(arguments, 2, changed(arguments[2], actions=arguments[2].actions.at[: len(actions)].set(actions)))
-
-
-def advantages_from_rewards_of_proposals(arguments, seen, frozen):
-    (critic, parts, *rest), _ = seen["advantages"]
-    bonus = jnp.mean(proposals_of(seen).proxy_mean)
-    parts = [changed(part, rewards=part.rewards + bonus) for part in parts]
-    rows, _, _ = seen["stages"].advantages(critic, parts, *rest)
-    return replaced(arguments, 2, rows)
-
-
-def advantages_plus_a_bonus_of_proposals(arguments, seen, frozen):
-    bonus = jnp.mean(proposals_of(seen).proxy_mean)
-    return replaced(arguments, 2, changed(arguments[2], advantages=arguments[2].advantages + bonus))
-
-
-def returns_of_proposals(arguments, seen, frozen):
-    bonus = jnp.mean(proposals_of(seen).proxy_mean)
-    return replaced(arguments, 2, changed(arguments[2], returns=arguments[2].returns + bonus))
-
-
-def logged_rows_for(position):
-    return lambda arguments, seen, frozen: replaced(arguments, position, logged(arguments[position], frozen.probe))
-
-
-def offline_moments_in_the_optimizer(name, stage, arguments, seen, frozen):
-    result = stage(*arguments)
-    if name != "actor":
-        return result
-    actor, optimizer, metrics = result
-    moments = jax.tree.map(lambda x: x + jnp.mean(frozen.probe.actions), optimizer.mu)
-    return actor, optimizer._replace(mu=moments), metrics
-
-
-STATIC_FAULTS = {
-    "offline rows in the actor loss": (tamper("actor", offline_rows_in_the_actor_loss), {RATIO, POLICY, REST}),
-    "offline actions among the proposals": (tamper("actor", offline_rows_among_the_proposals), {POLICY, REST}),
-    "proposals in the ratio": (tamper("actor", proposals_in_the_ratio), {RATIO}),
-    "advantages of rewards that proposals changed": (
-        tamper("actor", advantages_from_rewards_of_proposals),
-        {ADVANTAGES},
-    ),
-    "advantages that proposals changed": (tamper("actor", advantages_plus_a_bonus_of_proposals), {ADVANTAGES}),
-    "V's targets that proposals changed": (tamper("critic", returns_of_proposals), {V}),
-    "logged rows in V's loss": (tamper("critic", logged_rows_for(2)), {V, REST}),
-    "logged rows in PET": (tamper("adapt", logged_rows_for(2)), {PET, REST}),
-    "logged rows in Q's loss": (tamper("learn_q", logged_rows_for(2)), {REST}),
-    "logs in the optimizer's moments": (offline_moments_in_the_optimizer, {REST}),
-}
-
-
-@pytest.fixture(scope="module")
-def traceable(config):
-    """The stages as a run has them; they are traced and never compiled."""
-    return Stages(config, DIFFUSION)
-
-
-def violated(claims):
-    return {claim.statement for claim in claims if not claim.holds}
-
-
-def proved(learner, frozen, config, stages, fault=None):
-    with pytest.MonkeyPatch.context() as patch:
-        if fault is not None:
-            patch.setattr(proof, "iterate", with_fault(fault))
-        return proof.prove(learner, frozen, config, stages)
-
-
-def test_every_static_claim_holds_without_a_fault(learner, frozen, config, traceable):
-    claims = proved(learner, frozen, config, traceable)
-    assert [(claim.clause, claim.statement) for claim in claims] == [row[:2] for row in audit.FORBIDDEN]
-    assert violated(claims) == set()
-    # The hook that the faults are planted with changes nothing by itself.
-    harmless = proved(
-        learner, frozen, config, traceable, lambda name, stage, arguments, seen, frozen: stage(*arguments)
-    )
-    assert [str(claim) for claim in harmless] == [str(claim) for claim in claims]
-
-
-def test_plain_ppo_is_proved_too(config):
-    claims = proof.prove(learner_of(config, guided=False), None, config, Stages(config, None))
-    assert {claim.statement for claim in claims} == {RATIO, ADVANTAGES, V, POLICY, REST}
-    assert violated(claims) == set()
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name) for name in STATIC_FAULTS],
-)
-def test_a_planted_leak_fires_its_static_claims_and_no_other(learner, frozen, config, traceable, name):
-    fault, expected = STATIC_FAULTS[name]
-    assert violated(proved(learner, frozen, config, traceable, fault)) == expected
-
-
-def test_evidence_names_what_arrived(learner, frozen, config, traceable):
-    claims = proved(learner, frozen, config, traceable, tamper("critic", logged_rows_for(2)))
-    (claim,) = [claim for claim in claims if claim.statement == V]
-    assert str(claim) == f"VIOLATED (i)    {V}: reached by offline"
-
-
-def test_qs_gradient_in_vs_trunk_is_found(frozen):
-    shared = small_config(q_trunk="shared")
-    assert violated(proved(learner_of(shared), frozen, shared, Stages(shared, DIFFUSION))) == {V}
-
-
-def actor_gradient_into_the_prior(name, stage, arguments, seen, frozen):
-    """PET's result less the actor loss's gradient in the adapters, which the code blocks."""
-    result = stage(*arguments)
-    if name != "adapt":
-        return result
-    (state, *inputs), _ = seen["propose"]
-    (_, _, batch), _ = seen["gate"]
-    _, (actor, _, _) = seen["actor"]
-    weights = objective.Weights(jnp.float32(1), jnp.float32(1))
-
-    def actor_loss(adapters):
-        proposed = seen["stages"].propose(changed(state, adapters=adapters), *inputs)
-        gated, *_ = seen["stages"].gate(state, [proposed], batch)
-        return proposal_terms(actor, gated, weights)[0]
-
-    gradient = jax.grad(actor_loss)(state.adapters)
-    return jax.tree.map(lambda a, g: a - g, result[0], gradient), *result[1:]
-
-
-def test_an_unblocked_gradient_into_the_prior_is_found(learner, frozen, config, traceable, monkeypatch):
-    fault = actor_gradient_into_the_prior
-    # Blocked: the gradient is nothing at all.
-    assert violated(proved(learner, frozen, config, traceable, fault)) == set()
-    monkeypatch.setattr(jax.lax, "stop_gradient", lambda x: x)
-    claims = proved(learner, frozen, config, Stages(config, DIFFUSION), fault)
-    assert violated(claims) == {PET}
-    (evidence,) = [claim.evidence for claim in claims if claim.statement == PET]
-    assert {"actor", "q", "proposals"} <= {*evidence.removeprefix("reached by ").split(", ")}
-
-
-def test_a_program_in_which_the_tags_are_missing_proves_nothing():
-    claims = audit.static_claims(Flow({}, {}), Flow({}, {}))
-    assert violated(claims) == {RATIO, ADVANTAGES, V, POLICY, REST}
-
-
-# --- measured ----------------------------------------------------------------------------------------------------
 
 
 def measured(learner, frozen, stages, fault=None, iterations=(0,), rollout=rollout_of):

@@ -14,8 +14,9 @@ import statistics
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,6 @@ class Bench:
     repeats: int
     peers: Path | None
     say: Callable[[str], None]
-    memory: dict[str, list[float]] = field(default_factory=dict)
 
     def task(self, task: str) -> dict[str, Any]:
         """All figures of one task."""
@@ -55,48 +55,48 @@ class Bench:
         _run(["pretrain", "--logs", str(logs), "--out", str(prior), "--quiet"])
         row: dict[str, Any] = {"fit_s": time.perf_counter() - start}
         self.say(f"{task}: prior fitted to {LOG_ROWS:,} rows in {row['fit_s']:.0f} s, with start-up")
-        speeds, runs = self._interleaved(task, behaviour, prior)
+        speeds, memory, audits = self._interleaved(task, behaviour, prior)
         row["steps_per_second"] = {name: statistics.median(values) for name, values in speeds.items()}
-        row |= self._ratios(speeds, runs)
+        row |= self._ratios(speeds, memory)
+        row["audit_share"] = statistics.median(audits)
         row |= self._starts(task, prior)
         row |= self._side_by_side(task, prior)
         row["sampler_of_gemm"] = float(_python("-m", "ppo_dap.study.ceiling", "sampler", str(prior)))
         return row
 
     def _interleaved(self, task: str, behaviour: Path, prior: Path):
-        speeds: dict[str, list[float]] = {}
-        runs: dict[str, list[Path]] = {}
+        """Steps per second and peak memory by what was run, a value a repeat, and the method's shares of audits."""
+        speeds: dict[str, list[float]] = defaultdict(list)
+        memory: dict[str, list[float]] = defaultdict(list)
+        audits: list[float] = []
         for repeat in range(self.repeats):
             policy = str(behaviour / "policy.safetensors")
             ceiling = _python("-m", "ppo_dap.study.ceiling", "env", task, policy, str(self.steps))
-            speeds.setdefault("ceiling", []).append(float(ceiling))
+            speeds["ceiling"].append(float(ceiling))
             for name, options in VARIANTS.items():
                 folder = self.folder / f"{task}-{name}-{repeat}"
                 given = options if name == "ppo" else (*options, "--prior", str(prior))
-                self.memory.setdefault(f"{task} {name}", []).append(self._train(folder, task, given))
-                speeds.setdefault(name, []).append(speed(read_table(folder, "metrics")))
-                runs.setdefault(name, []).append(folder)
+                memory[name].append(self._train(folder, task, given))
+                metrics = read_table(folder, "metrics")
+                speeds[name].append(speed(metrics))
+                audits += [audit_share(metrics)] if name == "dap" else []
             for peer in PEERS if self.peers else ():
-                speeds.setdefault(peer, []).append(self._peer(peer, task))
+                speeds[peer].append(self._peer(peer, task))
             self.say(f"{task}, repeat {repeat + 1}: " + ", ".join(f"{n} {v[-1]:,.0f}" for n, v in speeds.items()))
-        return speeds, runs
+        return speeds, memory, audits
 
-    def _ratios(self, speeds: Mapping[str, Sequence[float]], runs: Mapping[str, Sequence[Path]]) -> dict[str, float]:
+    def _ratios(self, speeds: Mapping[str, Sequence[float]], memory: Mapping[str, Sequence[float]]) -> dict[str, float]:
         def ratio(above: str, below: str) -> float:
             """Median over the repeats of the ratio inside each."""
             pairs = zip(speeds[above], speeds[below], strict=True)
             return statistics.median(a / b for a, b in pairs)
 
-        task = runs["ppo"][0].name.removesuffix("-ppo-0")
-        memory = {name: statistics.median(self.memory[f"{task} {name}"]) for name in VARIANTS}
-        audits = [audit_share(read_table(folder, "metrics")) for folder in runs["dap"]]
         result = {
             "ppo_of_ceiling": ratio("ppo", "ceiling"),
             "dap_wall_x_ppo": ratio("ppo", "dap"),
-            "dap_memory_x_ppo": memory["dap"] / memory["ppo"],
+            "dap_memory_x_ppo": statistics.median(memory["dap"]) / statistics.median(memory["ppo"]),
             "dap_fast_wall_x_ppo": ratio("ppo", "dap_fast"),
             "dap_full_states_wall_x_ppo": ratio("ppo", "dap_full_states"),
-            "audit_share": statistics.median(audits),
         }
         for peer in PEERS if self.peers else ():
             result |= {f"ppo_x_{peer}": ratio("ppo", peer), f"dap_x_{peer}": ratio("dap", peer)}

@@ -50,7 +50,7 @@ def sweep(task: str, table: Path, say: Callable[[str], None]) -> None:
 def _prior(folder: Path, task: str) -> Path:
     """A prior on logs of an untrained policy: its cost does not depend on what it has learned."""
     behaviour, logs, prior = (folder / f"{task}-{part}" for part in ("behaviour", "logs.npz", "prior"))
-    train_for(folder / behaviour.name, task, ("--method", "ppo"), 2048)
+    train_for(behaviour, task, ("--method", "ppo"), 2048)
     from ppo_dap.logs import load_logs
     from ppo_dap.logs.npz import save_npz
     from ppo_dap.priors import fit_prior

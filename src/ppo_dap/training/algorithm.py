@@ -150,12 +150,7 @@ def iterate(
     settings, weights = schedule.settings, schedule.settings.added_weights
 
     # 1) Rollout with the current policy; 3) value-guided proposals on the states of each part that has been visited.
-    parts, proposed = [], []
-    for part in rollout:
-        if guide is not None and frozen is not None:
-            given = guide, frozen.denoiser, old.critic, part, normaliser, schedule.beta
-            proposed.append(run("proposals", stages.propose, *given, draws.proposals[len(parts)]))
-        parts.append(part)
+    parts, proposed = _collect_and_propose(learner, frozen, rollout, normaliser, schedule.beta, draws, stages, run)
 
     # 2) Advantages with GAE; rows and proposals that are not of the current batch lose their weight.
     rows, batch, metrics = run("gae", stages.advantages, old.critic, parts, normaliser, reward_std(), schedule.first_id)
@@ -179,14 +174,38 @@ def iterate(
     q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, visited, draws.q)
 
     # 5) PET: the adapters alone, on D_on.
-    given = guide, frozen.denoiser, visited, batch, schedule.pet_steps, draws.pet
-    adapters, pet_optimizer, adapted = run("pet", stages.adapt, *given)
+    adapters, pet_optimizer, adapted = run(
+        "pet", stages.adapt, guide, frozen.denoiser, visited, batch, schedule.pet_steps, draws.pet
+    )
 
     # 6) Monitoring.
-    given = actor, frozen.probe, normaliser, rows, batch, weights, improved["actor_gradient_norm"]
-    leaked = run("audit", stages.leakage, *given)
-    given = actor, frozen.denoiser, guide.adapters, adapters, gated.proposals, draws.audit
-    moved = run("audit", stages.prior_metrics, *given)
+    norm = improved["actor_gradient_norm"]
+    leaked = run("audit", stages.leakage, actor, frozen.probe, normaliser, rows, batch, weights, norm)
+    moved = run(
+        "audit", stages.prior_metrics, actor, frozen.denoiser, guide.adapters, adapters, gated.proposals, draws.audit
+    )
     ppo = PPOState(actor, critic, actor_optimizer, critic_optimizer)
     guide = GuideState(q, q_optimizer, q_spread, adapters, pet_optimizer)
     return Learner(ppo, guide), metrics | learned | adapted | leaked | moved
+
+
+def _collect_and_propose(
+    learner: Learner,
+    frozen: Frozen | None,
+    rollout: Iterable[Rollout],
+    normaliser: Normaliser,
+    beta: Float[Array, ""],
+    draws: Draws,
+    stages: Stages,
+    run: Callable[..., Any],
+) -> tuple[list[Rollout], list[Proposed]]:
+    """All parts of the rollout, and the proposals on each, dispatched before the next is collected."""
+    guide, critic = learner.guide, learner.ppo.critic
+    parts, proposed = [], []
+    for part in rollout:
+        if guide is not None and frozen is not None:
+            numbers = draws.proposals[len(parts)]
+            given = guide, frozen.denoiser, critic, part, normaliser, beta, numbers
+            proposed.append(run("proposals", stages.propose, *given))
+        parts.append(part)
+    return parts, proposed

@@ -1,7 +1,7 @@
 """Which core a run's rollout stays on.
 
 The policy and the thread that steps the environments take turns. On one core the hand-over is a switch; on two it wakes
-a sleeping core every time, which on a virtual machine costs up to a third of the stepping rate.
+a sleeping core every time, which costs stepping rate, most on a virtual machine.
 """
 
 from __future__ import annotations

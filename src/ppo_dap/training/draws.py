@@ -1,6 +1,6 @@
 """All random numbers of an iteration's update, drawn on the host: functions of (seed, iteration) and nothing else.
 
-Jitted stages are deterministic functions of arrays. numpy draws normal numbers five times as fast as XLA does on a CPU,
+Jitted stages are deterministic functions of arrays. numpy draws normal numbers several times as fast as XLA on a CPU,
 in the time that the host would spend waiting for the actor.
 """
 

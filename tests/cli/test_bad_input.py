@@ -1,146 +1,13 @@
-"""The commands: bad input is one line on stderr and exit code 2 with nothing written; the cheap good paths work."""
+"""Bad input is one line on stderr and exit code 2, with nothing written."""
 
-import dataclasses
-import json
-import subprocess
-import sys
-import typing
-import warnings
-
-import h5py
-import numpy as np
 import pytest
-from safetensors.numpy import save_file
 
-from ppo_dap.cli import field_docstrings, main
-from ppo_dap.config import Config, field_groups, flatten
-from ppo_dap.methods import METHODS
+from cli.cli_made import TASK, shell, snapshot
+from ppo_dap.cli import main
 
-TASK = "Pendulum-v1"  # 3 observations, 1 action in [-2, 2], no EnvPool to wait for
-COMMANDS = ("quickstart", "check-logs", "pretrain", "train", "evaluate", "audit", "summary", "collect", "methods")
 BC = f"train --task {TASK} --method ppo-bc --warm-start actor --out out --logs"
 PPO = f"train --task {TASK} --method ppo --out out"
 DAP = f"train --task {TASK} --out out --prior"
-
-
-def arrays(observation_size=3, action_size=1, rows=12):
-    rng = np.random.default_rng(0)
-    truncated = np.zeros(rows, bool)
-    truncated[rows // 2 - 1 :: rows // 2] = True
-    return {
-        "observations": rng.normal(size=(rows, observation_size)).astype(np.float32),
-        "actions": rng.uniform(-2, 2, (rows, action_size)).astype(np.float32),
-        "rewards": rng.normal(size=rows).astype(np.float32),
-        "truncated": truncated,
-    }
-
-
-def write_logs(folder):
-    good = arrays()
-    holed = {**good, "observations": good["observations"].copy()}
-    holed["observations"][5, 1] = np.nan
-    contents = {
-        "good": good,
-        "nan": holed,
-        "wide": arrays(observation_size=4),
-        "two": arrays(action_size=2),
-        "hopper": {**good, "task": np.array("Hopper-v5")},
-        "pickled": {**good, "actions": np.array([{"a": 1}] * 12, dtype=object)},
-        "keys": {**good, "observation": good["observations"]},
-        "none": {},
-        "rowless": {name: value[:0] for name, value in good.items()},
-    }
-    for name, content in contents.items():
-        np.savez(folder / f"{name}.npz", **content)
-    whole = (folder / "good.npz").read_bytes()
-    (folder / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    (folder / "empty.npz").write_bytes(b"")
-    with h5py.File(folder / "good.hdf5", "w") as file:
-        for name, value in good.items():
-            file["timeouts" if name == "truncated" else name] = value
-    whole = (folder / "good.hdf5").read_bytes()
-    (folder / "cut.hdf5").write_bytes(whole[: len(whole) // 2])
-    (folder / "logs.csv").write_text("1,2\n")
-
-
-def write_priors(folder):
-    import jax.numpy as jnp
-
-    from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-    from ppo_dap.priors.prior import DiffusionPrior
-
-    config = DiffusionConfig(width=4)
-
-    def save(name, task, observation_size=3, action_size=1, high=2.0):
-        moments = jnp.zeros(observation_size), jnp.ones(observation_size), jnp.ones(())
-        high = np.full(action_size, high, np.float32)
-        probe = np.zeros((2, observation_size), np.float32), np.zeros((2, action_size), np.float32)
-        denoiser = Denoiser.create(np.random.default_rng(0), config, *moments, action_size)
-        DiffusionPrior(denoiser, config, -high, high, task, "hash", {}, *probe).save(folder / name)
-
-    save("prior", TASK)
-    save("prior-wide", "Hopper-v5", observation_size=11, action_size=3)
-    save("prior-two", None, action_size=2)
-    save("prior-other", "Swing-v0")
-    save("prior-bounds", None, high=1.0)
-    whole = (folder / "prior").read_bytes()
-    (folder / "prior-cut").write_bytes(whole[: len(whole) // 2])
-    (folder / "prior-empty").write_bytes(b"")
-    (folder / "prior-text").write_text("not a prior\n")
-    save_file({"a": np.zeros(2)}, folder / "prior-foreign")
-    header = {"kind": "prior", "format": 2, "prior": "diffusion"}
-    save_file({"a": np.zeros(2)}, folder / "prior-newer", {"meta": json.dumps(header)})
-    header = {"kind": "prior", "format": 1, "prior": "flow"}
-    save_file({"a": np.zeros(2)}, folder / "prior-kind", {"meta": json.dumps(header)})
-
-
-def write_runs(folder):
-    from ppo_dap.nets.policy import Policy
-
-    one, three = np.ones(1, np.float32), np.ones(3, np.float32)
-    layers = ((np.ones((1, 3), np.float32),), (np.zeros(1, np.float32),))
-    policy = Policy(*layers, -one, 0 * three, three, 10.0, -2 * one, 2 * one, TASK)
-    for name in ("run", "run-newer", "run-policyless"):
-        (folder / name).mkdir()
-        description = {
-            "task": TASK,
-            "method": "ppo",
-            "preset": "paper",
-            "prior_hash": None,
-            "config": flatten(Config()) | {"steps": 7},
-        }
-        (folder / name / "config.json").write_text(json.dumps(description))
-        (folder / name / "evaluations.jsonl").write_text(json.dumps({"env_steps": 5, "return_mean": 1.0}) + "\n")
-        (folder / name / "metrics.jsonl").write_text(json.dumps({"env_steps": 5}) + "\n")
-    policy.save(folder / "run" / "policy.safetensors")
-    meta = {"meta": json.dumps({"kind": "policy", "format": 99})}
-    save_file({"a": np.zeros(2)}, folder / "run-newer" / "policy.safetensors", meta)
-    (folder / "damaged").mkdir()
-    (folder / "damaged" / "config.json").write_text('{"task": "Pend')
-    (folder / "other").mkdir()
-    (folder / "other" / "notes.txt").write_text("mine\n")
-    (folder / "file").write_text("mine\n")
-    (folder / "bare").mkdir()
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    write_logs(folder)
-    write_priors(folder)
-    write_runs(folder)
-    return folder
-
-
-def snapshot(*folders):
-    return {path: path.read_bytes() if path.is_file() else None for folder in folders for path in folder.rglob("*")}
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    """The working folder, empty: a file that is written anywhere but where it should is seen."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def one_line(err, words):
@@ -293,11 +160,6 @@ def test_bad_input(capsys, files, here, monkeypatch, case):
     is_refused(capsys, files, here, *BAD[case])
 
 
-def shell(here, *arguments):
-    """The command as a user runs it: no type checker, warnings as they come."""
-    return subprocess.run([sys.executable, "-m", "ppo_dap.cli", *arguments], cwd=here, capture_output=True, text=True)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -311,17 +173,6 @@ def test_a_choice_that_does_not_exist(here, options, words):
     assert (done.returncode, done.stdout, list(here.iterdir())) == (2, "", [])
 
 
-def test_a_warning_is_one_line_too(files, here):
-    """Logs that mark no episode ends are warned about, and the warning is no Python source line."""
-    unmarked = {name: value for name, value in arrays(observation_size=4).items() if name != "truncated"}
-    np.savez(here / "unmarked.npz", **unmarked)
-    done = shell(here, "check-logs", "--logs", "unmarked.npz")
-    assert done.returncode in (0, 1)
-    assert "nothing marks an episode's end" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert ".py:" not in done.stderr
-
-
 def test_pretrain_into_a_folder(capsys, files, here, monkeypatch):
     import ppo_dap.priors
 
@@ -329,82 +180,3 @@ def test_pretrain_into_a_folder(capsys, files, here, monkeypatch):
     monkeypatch.setattr(ppo_dap.priors, "fit_prior", lambda logs, **options: prior)
     command = f"pretrain --logs @good.npz --task {TASK} --out @other"
     is_refused(capsys, files, here, command, "cannot write prior", "other")
-
-
-@pytest.mark.parametrize("name", ["wide", "two"])
-def test_check_logs_of_other_dimensions_says_so(capsys, files, here, name):
-    assert main(["check-logs", "--logs", str(files / f"{name}.npz"), "--task", TASK]) == 2
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    (line,) = (line for line in captured.out.splitlines() if line.startswith("error"))
-    assert "dimensions" in line
-    assert "must be equal" in line
-    assert list(here.iterdir()) == []
-
-
-def test_check_logs_of_the_sample(capsys, here):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        code = main(["check-logs", "--logs", "hopper-medium"])
-    captured = capsys.readouterr()
-    assert code in (0, 1)
-    assert "dimensions" in captured.out
-    assert "error" not in captured.out
-    assert captured.err == ""
-
-
-def test_check_logs_as_json(capsys, files):
-    assert main(["check-logs", "--logs", str(files / "good.hdf5"), "--json"]) in (0, 1)
-    assert {"level", "name", "message"} == set(json.loads(capsys.readouterr().out)[0])
-
-
-def test_methods(capsys):
-    assert main(["methods"]) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    assert all(name in captured.out for name in METHODS)
-    assert "diffusion-novg = ppo-dap-no-vg" in captured.out
-
-
-def test_methods_as_json(capsys):
-    assert main(["methods", "--json"]) == 0
-    assert [row["method"] for row in json.loads(capsys.readouterr().out)] == list(METHODS)
-
-
-def test_no_command_is_help(capsys):
-    assert main([]) == 0
-    out = capsys.readouterr().out
-    assert all(name in out for name in COMMANDS)
-
-
-@pytest.mark.parametrize("command", [(), *((name,) for name in COMMANDS)])
-def test_help(capsys, command):
-    with pytest.raises(SystemExit) as stop:
-        main([*command, "--help"])
-    assert stop.value.code == 0
-    captured = capsys.readouterr()
-    assert captured.out.startswith("usage: ppo-dap")
-    assert captured.err == ""
-
-
-def test_every_setting_has_a_flag_and_help(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100000")
-    with pytest.raises(SystemExit):
-        main(["train", "--help"])
-    text = " ".join(capsys.readouterr().out.split())
-    for cls in typing.get_type_hints(Config).values():
-        texts = field_docstrings(cls)
-        for field in dataclasses.fields(cls):
-            assert len(texts[field.name]) > 10
-            flag = field.name.replace("_", "-")
-            assert f"--{flag} X {texts[field.name]} (default: {field.default})" in text
-    assert len(field_groups()) > 40
-
-
-def test_evaluate_and_collect(capsys, files, here):
-    run = str(files / "run")
-    assert main(["evaluate", run, "--episodes", "1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["episodes"] == 1
-    assert main(["collect", run, "--steps", "200", "--out", "out.npz"]) == 0
-    assert "out.npz: " in capsys.readouterr().out
-    assert main(["check-logs", "--logs", "out.npz"]) in (0, 1)
