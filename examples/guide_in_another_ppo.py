@@ -3,15 +3,15 @@
 All it takes: fit a prior to the logs, ask the Guide for proposals once an iteration, add two terms to the loss (Eq. 9).
 """
 
+import argparse
+
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import tyro
 from jax.example_libraries.stax import Dense, Tanh, serial
 from jax.scipy.stats.norm import logpdf
-from jax.tree_util import Partial
 from scipy.signal import lfilter
 
 import ppo_dap
@@ -52,7 +52,7 @@ def _step(params, state, obs, action, old_log_prob, advantage, target, proposals
     return optax.apply_updates(params, updates), state
 
 
-def main(iterations: int = 30) -> None:
+def main(iterations: int) -> None:
     """Train, and print the mean return of each iteration's episodes."""
     envs, rng, *keys = gym.make_vec("Pendulum-v1", ENVS), np.random.default_rng(0), *map(jax.random.key, (0, 1))
     obs, act = (x.reshape(ROWS, -1) for x in _play(envs, _old_controller, 0.3, rng)[:2])  # the logs
@@ -61,13 +61,12 @@ def main(iterations: int = 30) -> None:
     guide = ppo_dap.Guide(prior, total_iterations=iterations, minibatch_size=MINIBATCH)
     state = ADAM.init(params := {"pi": INIT(keys[0], (3,))[1], "v": INIT(keys[1], (3,))[1], "log_std": jnp.zeros(1)})
     for iteration in range(iterations):
-        pi, std = Partial(NET, params["pi"]), np.exp(params["log_std"])
+        pi, std = jax.tree_util.Partial(NET, params["pi"]), np.exp(params["log_std"])
         obs, act, rewards, following = _play(envs, pi, std, rng)
         values, next_values = (np.asarray(NET(params["v"], x))[..., 0] for x in (obs, following))
         deltas = rewards + GAMMA * next_values - values  # no episode terminates, so V follows the cut too
         gae = lfilter([1], [1, -GAMMA * GAE_LAMBDA], deltas[:, ::-1])[:, ::-1]
-        scaled, old = (gae - gae.mean()) / gae.std(), logpdf(act, pi(obs), std).sum(-1)
-        columns = obs, act, old, scaled, gae + values, rewards, next_values
+        columns = obs, act, logpdf(act, pi(obs), std).sum(-1), (gae - gae.mean()) / gae.std(), gae + values, rewards, next_values
         *rows, r, v = (np.asarray(x, np.float32).reshape(ROWS, *x.shape[2:]) for x in columns)
         proposals = guide(observations=rows[0], actions=rows[1].clip(-2, 2), rewards=r, next_values=v, terminated=0 * r)
         for i in rng.permuted(np.tile(np.arange(ROWS), (EPOCHS, 1)), axis=1).reshape(-1, MINIBATCH):
@@ -76,4 +75,5 @@ def main(iterations: int = 30) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    (parser := argparse.ArgumentParser()).add_argument("--iterations", type=int, default=30)
+    main(parser.parse_args().iterations)
