@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 import ppo_dap
 
-ENVS, STEPS, MINIBATCH, EPOCHS = 16, 200, 64, 10  # an iteration: one episode (200 steps, then cut off) of each
+ENVS, STEPS, MINIBATCH, EPOCHS = 16, 200, 64, 10  # an iteration: an episode each, cut off after 200 steps: V goes on
 GAMMA, GAE_LAMBDA, CLIP, LAMBDA_KL, LAMBDA_AUX = 0.95, 0.95, 0.2, 5e-3, 1e-2
 INIT, NET = serial(Dense(64), Tanh, Dense(64), Tanh, Dense(1))  # the policy's mean, and V
 ADAM, ROWS, SCALE = optax.adam(1e-3), ENVS * STEPS, 100
@@ -64,9 +64,9 @@ def main(iterations: int) -> None:
         pi, std = jax.tree_util.Partial(NET, params["pi"]), np.exp(params["log_std"])
         obs, act, rewards, following = _play(envs, pi, std, rng)
         values, next_values = (np.asarray(NET(params["v"], x))[..., 0] for x in (obs, following))
-        deltas = rewards + GAMMA * next_values - values  # no episode terminates, so V follows the cut too
-        gae = lfilter([1], [1, -GAMMA * GAE_LAMBDA], deltas[:, ::-1])[:, ::-1]
-        columns = obs, act, logpdf(act, pi(obs), std).sum(-1), (gae - gae.mean()) / gae.std(), gae + values, rewards, next_values
+        gae = lfilter([1], [1, -GAMMA * GAE_LAMBDA], (rewards + GAMMA * next_values - values)[:, ::-1])[:, ::-1]
+        scaled, old = (gae - gae.mean()) / gae.std(), logpdf(act, pi(obs), std).sum(-1)
+        columns = obs, act, old, scaled, gae + values, rewards, next_values
         *rows, r, v = (np.asarray(x, np.float32).reshape(ROWS, *x.shape[2:]) for x in columns)
         proposals = guide(observations=rows[0], actions=rows[1].clip(-2, 2), rewards=r, next_values=v, terminated=0 * r)
         for i in rng.permuted(np.tile(np.arange(ROWS), (EPOCHS, 1)), axis=1).reshape(-1, MINIBATCH):
