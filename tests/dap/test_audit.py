@@ -138,9 +138,10 @@ def test_spr_is_1_when_every_state_gets_proposals(frozen):
     parts, critic = parts_of(rollout, everything), learner.ppo.critic
     rows, batch, _ = stages.advantages(critic, parts, NORMALISER, REWARD_STD, jnp.int32(0))
     assert len(rows.weights) == ROWS
+    proposer = learner.guide.proposer(frozen.denoiser, critic)
     proposed = [
-        stages.propose(learner.guide, frozen.denoiser, critic, part, NORMALISER, jnp.float32(1), numbers)
-        for part, numbers in zip(parts, draws.proposals, strict=True)
+        stages.propose(proposer, x.state_ids, x.observations, x.valid, NORMALISER, jnp.float32(1), numbers)
+        for x, numbers in zip(parts, draws.proposals, strict=True)
     ]
     gated, _, metrics = stages.gate(learner.guide, proposed, batch)
     assert sorted(gated.proposals.state_ids.tolist()) == list(range(ROWS))

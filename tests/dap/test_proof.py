@@ -143,13 +143,13 @@ def actor_gradient_into_the_prior(name, stage, arguments, seen, frozen):
     result = stage(*arguments)
     if name != "adapt":
         return result
-    (state, *inputs), _ = seen["propose"]
-    (_, _, batch), _ = seen["gate"]
+    (proposer, *inputs), _ = seen["propose"]
+    (state, _, batch), _ = seen["gate"]
     _, (actor, _, _) = seen["actor"]
     weights = objective.Weights(jnp.float32(1), jnp.float32(1))
 
     def actor_loss(adapters):
-        proposed = seen["stages"].propose(changed(state, adapters=adapters), *inputs)
+        proposed = seen["stages"].propose(proposer._replace(adapters=adapters), *inputs)
         gated, *_ = seen["stages"].gate(state, [proposed], batch)
         return proposal_terms(actor, gated, weights)[0]
 

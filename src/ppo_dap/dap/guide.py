@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,6 +34,20 @@ class GuideState(eqx.Module):
     q_spread: Float[Array, ""]
     adapters: Adapters
     pet_optimizer: optax.OptState
+
+    def proposer(self, denoiser: Denoiser, critic: Critic | None) -> Proposer:
+        """With the frozen denoiser, and the critic whose trunk Q reads."""
+        return Proposer(denoiser, self.adapters, self.q, self.q_spread, critic)
+
+
+class Proposer(NamedTuple):
+    """What proposals are made with: no optimizer, since each array that a stage is called with costs the host time."""
+
+    denoiser: Denoiser
+    adapters: Adapters
+    q: QFunction
+    q_spread: Float[Array, ""]
+    critic: Critic | None
 
 
 class Visited(eqx.Module):
@@ -100,9 +115,7 @@ def num_proposal_states(num_rows: int, parts: int, config: Config) -> int:
 
 
 def make_proposals(
-    guide: GuideState,
-    denoiser: Denoiser,
-    critic: Critic | None,
+    proposer: Proposer,
     visited: Visited,
     beta: Float[Array, ""],
     draws: ProposalDraws,
@@ -117,16 +130,16 @@ def make_proposals(
         visited.state_ids[index],
         visited.raw_observations[index],
         observations,
-        q_features(critic, guide.q, observations, shared=False),
+        q_features(proposer.critic, proposer.q, observations, shared=False),
     )
     proposals, metrics = propose(
-        denoiser,
-        guide.adapters,
-        guide.q,
+        proposer.denoiser,
+        proposer.adapters,
+        proposer.q,
         states,
         draws,
         beta,
-        guide.q_spread,
+        proposer.q_spread,
         diffusion=diffusion,
         config=config.proposals,
     )

@@ -90,7 +90,7 @@ class Guide:
         denoiser, state = self.prior.denoiser, self._state
         draws = ProposalDraws.make(rng, n, num_proposal_states(n, 1, self.config), act, proposals)
         visited = Visited(rows.state_ids, rows.raw_observations, rows.observations, rows.weights)
-        proposed = self._propose(state, denoiser, None, visited, jnp.asarray(beta, jnp.float32), draws)
+        proposed = self._propose(state.proposer(denoiser, None), visited, jnp.asarray(beta, jnp.float32), draws)
         gated, spread, of_proposals = self._gate(state, [proposed], batch)
         q, _, q_optimizer, learned = self._learn_q(state, None, rows, draw_orders(rng, self.config.q.q_epochs, n))
         frequency = self.config.adaptation.pet_frequency

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ppo_dap.nets.policy import Policy
 from ppo_dap.tasks import VectorEnv
+from ppo_dap.tasks.vector import Transition
 
 # A collector's arrays are numpy's; inside a jitted stage, where they are used, they are JAX's.
 if TYPE_CHECKING:
@@ -67,39 +68,32 @@ class Collector:
         self.env_seconds = 0.0
         for part in range(parts):
             noise = rng.standard_normal((time, envs, act), dtype=np.float32)
-            out = self._part(policy, noise, std * noise)
+            out = self._part(policy, std * noise)
             first = (iteration * parts + part) * time * envs
             ids = np.arange(first, first + time * envs, dtype=np.int32).reshape(time, envs)
             yield Rollout(**out, log_probs=policy.log_prob_of_noise(noise), state_ids=ids)  # type: ignore[arg-type]
 
-    def _part(self, policy: Policy, noise: np.ndarray, spread: np.ndarray) -> dict[str, np.ndarray]:
-        time, envs, act = noise.shape
-        out = _empty(time, envs, self.observations.shape[1], act)
-        for t in range(time):
+    def _part(self, policy: Policy, spread: np.ndarray) -> dict[str, np.ndarray]:
+        steps, acted_on, means = [], [], []
+        for t in range(len(spread)):
             mean = policy.mean(self.observations)
-            action = mean + spread[t]
-            actions = policy.unscale(action)
+            means.append(mean)
+            acted_on.append(self.observations)
+            actions = policy.unscale(mean + spread[t])
             start = clock.perf_counter()
             step = self.env.step(actions)
             self.env_seconds += clock.perf_counter() - start
-            out["observations"][t], out["next_observations"][t] = self.observations, step.next_observations
-            out["actions"][t], out["means"][t] = action, mean
-            out["rewards"][t], out["valid"][t] = step.rewards, step.valid
-            out["terminated"][t], out["truncated"][t] = step.terminated, step.truncated
+            steps.append(step)
             self._count(step)
             self.observations = step.observations
-        return out
+        columns = zip(Transition._fields, zip(*steps, strict=True), strict=True)
+        out = {name: np.stack(column) for name, column in columns}
+        out["means"] = np.stack(means)
+        return out | {"observations": np.stack(acted_on), "actions": out["means"] + spread}
 
     def _count(self, step) -> None:
         self.returns += step.rewards
         ended = step.terminated | step.truncated
-        if ended.any():
+        if np.count_nonzero(ended):
             self.finished_returns.extend(self.returns[ended].tolist())
             self.returns[ended] = 0.0
-
-
-def _empty(time: int, envs: int, obs: int, act: int) -> dict[str, np.ndarray]:
-    flags = {name: np.empty((time, envs), bool) for name in ("terminated", "truncated", "valid")}
-    wide = {"observations": obs, "next_observations": obs, "actions": act, "means": act}
-    arrays = {name: np.empty((time, envs, size), np.float32) for name, size in wide.items()}
-    return {**flags, **arrays, "rewards": np.empty((time, envs), np.float32)}

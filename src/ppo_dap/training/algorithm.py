@@ -10,13 +10,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ppo_dap.config import Config
 from ppo_dap.dap import audit
 from ppo_dap.dap.guide import (
     GuideState,
     Proposed,
+    Proposer,
     Visited,
     adapt_prior,
     create_guide,
@@ -104,10 +105,10 @@ def _advantages(
 
 
 def _propose(
-    guide: GuideState,
-    denoiser: Denoiser,
-    critic: Critic,
-    part: Rollout,
+    proposer: Proposer,
+    state_ids: Int[Array, "time envs"],
+    observations: Float[Array, "time envs obs"],
+    valid: Bool[Array, "time envs"],
     normaliser: Normaliser,
     beta: Float[Array, ""],
     draws: ProposalDraws,
@@ -115,14 +116,10 @@ def _propose(
     config: Config,
     diffusion: DiffusionConfig,
 ) -> Proposed:
-    raw = part.observations.reshape(-1, part.observations.shape[-1])
-    visited = Visited(
-        part.state_ids.reshape(-1),
-        raw,
-        normaliser(raw, config.ppo.observation_clip),
-        part.valid.reshape(-1).astype(jnp.float32),
-    )
-    return make_proposals(guide, denoiser, critic, visited, beta, draws, config=config, diffusion=diffusion)
+    raw = observations.reshape(-1, observations.shape[-1])
+    normalised = normaliser(raw, config.ppo.observation_clip)
+    visited = Visited(state_ids.reshape(-1), raw, normalised, valid.reshape(-1).astype(jnp.float32))
+    return make_proposals(proposer, visited, beta, draws, config=config, diffusion=diffusion)
 
 
 def call(name: str, stage: Callable[..., Any], *arguments: Any) -> Any:
@@ -135,7 +132,7 @@ def iterate(
     frozen: Frozen | None,
     rollout: Iterable[Rollout],
     normaliser: Normaliser,
-    reward_std: Callable[[], Float[Array, ""]],
+    reward_std: Callable[[], Any],
     schedule: Schedule,
     draws: Draws,
     stages: Stages,
@@ -150,7 +147,7 @@ def iterate(
     settings, weights = schedule.settings, schedule.settings.added_weights
 
     # 1) Rollout with the current policy; 3) value-guided proposals on the states of each part that has been visited.
-    parts, proposed = _collect_and_propose(learner, frozen, rollout, normaliser, schedule.beta, draws, stages, run)
+    parts, proposed = _collect_and_propose(learner, frozen, rollout, normaliser, schedule, draws, stages, run)
 
     # 2) Advantages with GAE; rows and proposals that are not of the current batch lose their weight.
     rows, batch, metrics = run("gae", stages.advantages, old.critic, parts, normaliser, reward_std(), schedule.first_id)
@@ -194,18 +191,20 @@ def _collect_and_propose(
     frozen: Frozen | None,
     rollout: Iterable[Rollout],
     normaliser: Normaliser,
-    beta: Float[Array, ""],
+    schedule: Schedule,
     draws: Draws,
     stages: Stages,
     run: Callable[..., Any],
 ) -> tuple[list[Rollout], list[Proposed]]:
     """All parts of the rollout, and the proposals on each, dispatched before the next is collected."""
-    guide, critic = learner.guide, learner.ppo.critic
+    proposer = None
+    if learner.guide is not None and frozen is not None:
+        proposer = learner.guide.proposer(frozen.denoiser, learner.ppo.critic)
     parts, proposed = [], []
     for part in rollout:
-        if guide is not None and frozen is not None:
+        if proposer is not None:
+            states = part.state_ids, part.observations, part.valid
             numbers = draws.proposals[len(parts)]
-            given = guide, frozen.denoiser, critic, part, normaliser, beta, numbers
-            proposed.append(run("proposals", stages.propose, *given))
+            proposed.append(run("proposals", stages.propose, proposer, *states, normaliser, schedule.beta, numbers))
         parts.append(part)
     return parts, proposed

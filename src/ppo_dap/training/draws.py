@@ -14,9 +14,9 @@ from jaxtyping import Int
 
 from ppo_dap.config import Config
 from ppo_dap.dap.adaptation import PETDraws
-from ppo_dap.dap.audit import PROXY_STATES
+from ppo_dap.dap.audit import PROXY_SOLVER, PROXY_STATES
 from ppo_dap.dap.guide import num_proposal_states
-from ppo_dap.dap.proposals import ProposalDraws, solver
+from ppo_dap.dap.proposals import ProposalDraws
 from ppo_dap.ppo.update import Orders, draw_orders
 
 PARTS = 8
@@ -60,5 +60,5 @@ def draw(config: Config, iteration: int, action_size: int, guided: bool) -> Draw
         ),
         draw_orders(rng, config.q.q_epochs, rows),
         PETDraws.make(rng, action_size, updates, config.adaptation),
-        rng.standard_normal(solver(config.proposals).noise_shape(few, k, action_size), dtype=np.float32),
+        rng.standard_normal(PROXY_SOLVER.noise_shape(few, k, action_size), dtype=np.float32),
     )

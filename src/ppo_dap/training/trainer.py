@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ppo_dap.config import Config
@@ -126,7 +125,7 @@ class Trainer:
             state.learner,
             self.frozen,
             self._collect(collector, parts),
-            Normaliser(_f32(state.observations.mean), _f32(state.observations.std)),
+            Normaliser(_array(state.observations.mean), _array(state.observations.std)),
             lambda: self._reward_std(parts),
             self.schedule(),
             self._draws(state.iteration),
@@ -178,14 +177,14 @@ class Trainer:
             return self._next_draws[1]
         return draw(self.config, iteration, self.spec.action_size, self.frozen is not None)
 
-    def _reward_std(self, parts: list[Rollout]) -> jax.Array:
+    def _reward_std(self, parts: list[Rollout]) -> np.ndarray:
         """What this rollout's rewards are divided by: the running scale with the rollout itself in it."""
         rewards, ended, valid = (
             np.concatenate(x)
             for x in zip(*((p.rewards, p.terminated | p.truncated, p.valid) for p in parts), strict=True)
         )
         self.state.reward_scale = self.state.reward_scale.update(rewards, ended, valid, self.config.ppo.gamma)
-        return _f32(self.state.reward_scale.std)
+        return _array(self.state.reward_scale.std)
 
     def schedule(self) -> Schedule:
         """What the run's progress sets for the next iteration."""
@@ -198,12 +197,12 @@ class Trainer:
         updates = ppo.num_epochs * ppo.rollout_steps // ppo.minibatch_size
         pet = [steps_until(state.iteration + i, config.adaptation.pet_frequency, updates) for i in (0, 1)]
         guided = self.frozen is not None
-        weights = Weights(_f32(objective.lambda_kl * decay), _f32(objective.lambda_aux * decay))
+        weights = Weights(_array(objective.lambda_kl * decay), _array(objective.lambda_aux * decay))
         return Schedule(
-            jnp.asarray(state.iteration * ppo.rollout_steps, jnp.int32),
-            Settings(_f32(rate), _f32(limit), jnp.asarray(guided), weights if guided else ()),
-            _f32(beta_schedule(progress, config.proposals.beta_max, config.proposals.beta_anneal)),
-            jnp.asarray(pet[1] - pet[0], jnp.int32),
+            _array(state.iteration * ppo.rollout_steps, np.int32),
+            Settings(_array(rate), _array(limit), _array(guided, np.bool_), weights if guided else ()),
+            _array(beta_schedule(progress, config.proposals.beta_max, config.proposals.beta_anneal)),
+            _array(pet[1] - pet[0], np.int32),
         )
 
     def _reduce_lr(self, policy_kl: float) -> None:
@@ -286,8 +285,9 @@ class Trainer:
             signal.signal(signal.SIGINT, previous)
 
 
-def _f32(value: float | np.ndarray) -> jax.Array:
-    return jnp.asarray(value, jnp.float32)
+def _array(value: Any, dtype: Any = np.float32) -> Any:
+    """numpy's: making a JAX array of it here would cost ten times what passing it to a stage does."""
+    return np.asarray(value, dtype)
 
 
 def _seed(*numbers: int) -> int:
