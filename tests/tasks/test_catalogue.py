@@ -76,7 +76,7 @@ def test_episodes_are_as_long_as_the_catalogue_says(task):
         assert env.spec.max_episode_steps == CATALOGUE[task].episode_length
 
 
-@pytest.mark.parametrize("task", [task for task in CATALOGUE if task not in ("Ant-v5", "HumanoidStandup-v5")])
+@pytest.mark.parametrize("task", [task for task in CATALOGUE if task != "Ant-v5"])
 def test_an_episode_ends_as_the_catalogue_says(task):
     """Random actions in three copies for one episode: they fall where they can, and are truncated elsewhere."""
     spec, rng = describe(task), np.random.default_rng(0)
