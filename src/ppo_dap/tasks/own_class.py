@@ -23,8 +23,6 @@ def make_own(path: str, **options: Any) -> Any:
     Nothing is wrapped round it: it truncates and terminates as it says itself. The module is looked for where Python
     looks, and in the current folder. Raises `InputError` where it cannot be imported or holds no such environment.
     """
-    import gymnasium
-
     module_name, _, name = path.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # the `ppo-dap` command, unlike `python`, does not look there by itself
@@ -38,12 +36,10 @@ def make_own(path: str, **options: Any) -> Any:
     if not _is_env(found):
         raise InputError(f"task {path!r} is {_kind(found)}, not a class derived from gymnasium.Env")
     try:
-        env = found(**options)
+        return found(**options)
     except Exception as error:
         how = "without arguments" if not options else f"with {', '.join(options)}"
         raise InputError(f"task {path!r} cannot be made {how}: {_line(error)}") from error
-    assert isinstance(env, gymnasium.Env)
-    return env
 
 
 def _is_env(value: Any) -> bool:
