@@ -122,7 +122,7 @@ def train(
     prior = _check_prior(chosen, prior, spec)
     logs = _check_logs(config, logs, spec)
     description = {
-        "task": task,
+        "task": spec.task,
         "method": chosen.name,
         "preset": preset,
         "config": configs.flatten(config),

@@ -1,4 +1,4 @@
-"""A task's own discount is the default of its runs, and no more than that."""
+"""What a run takes from its task: the discount, unless the user sets one, and the short id."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from ppo_dap.training import run
 
 @pytest.fixture
 def resolved(monkeypatch, tmp_path):
-    """`train` up to the trainer; returns the config that the trainer gets and the one that is written down."""
+    """`train` up to the trainer; returns the discount that the trainer gets, and discount and task as written down."""
 
     def configs(task, **options):
         seen = []
@@ -18,7 +18,7 @@ def resolved(monkeypatch, tmp_path):
                 pass
 
         def make(config, spec, prior, logs, folder, description, *rest):
-            seen.append((config.ppo.gamma, description["config"]["gamma"]))
+            seen.append((config.ppo.gamma, description["config"]["gamma"], description["task"]))
             return Trainer()
 
         monkeypatch.setattr(run, "_make_trainer", make)
@@ -42,4 +42,10 @@ def resolved(monkeypatch, tmp_path):
     ],
 )
 def test_the_discount_is_the_users_or_the_tasks_or_the_recipes(resolved, preset, task, options, gamma):
-    assert resolved(task, preset=preset, **options) == (gamma, gamma)
+    assert resolved(task, preset=preset, **options)[:2] == (gamma, gamma)
+
+
+@pytest.mark.parametrize("task", ["Striker-v2", "ppo_dap/Striker-v2"])
+def test_a_run_of_striker_has_one_name_whatever_it_was_called(resolved, task):
+    """Logs collected from it, and priors fitted to those, carry the name, and are compared by it."""
+    assert resolved(task)[2] == "Striker-v2"
