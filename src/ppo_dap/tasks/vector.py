@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ppo_dap.tasks.catalogue import ENVPOOL_TASKS, describe, make_gymnasium
+from ppo_dap.tasks.catalogue import describe, make_gymnasium
 
 
 class Transition(NamedTuple):
@@ -49,17 +49,20 @@ class VectorEnv(Protocol):
 
 
 def make_vector_env(task: str, num_envs: int, seed: int, threads: int = 1) -> VectorEnv:
-    """`num_envs` copies of `task`: EnvPool where it serves the id, Gymnasium for every other.
+    """`num_envs` copies of `task`: EnvPool where it serves the id, our own for Striker, Gymnasium for every other.
 
     Raises `InputError` for an unknown id or spaces that are not boxes.
     """
-    seed = seed % 2**31
-    if task in ENVPOOL_TASKS:
+    seed, spec = seed % 2**31, describe(task)
+    if spec.backend == "envpool":
         import envpool
 
         env = envpool.make_gymnasium(task, num_envs=num_envs, num_threads=min(threads, num_envs), seed=seed)
         return NextStepEnv(env, num_envs, None)
-    describe(task)
+    if spec.backend == "mujoco":
+        from ppo_dap.tasks.striker_vector import StrikerVectorEnv
+
+        return StrikerVectorEnv(num_envs, seed, threads)
     from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
     env = SyncVectorEnv([lambda: make_gymnasium(task)] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)

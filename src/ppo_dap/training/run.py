@@ -106,21 +106,23 @@ def train(
 ) -> Run:
     """Train `method` on `task` and write everything to the run folder `out`.
 
-    `prior` is needed by methods that have one, `logs` by a warm start; `options` are fields of `Config` by name. With
-    `resume` the run in `out` goes on from its last checkpoint, under the config that it was started with.
+    `prior` is needed by methods that have one, `logs` by a warm start; `options` are fields of `Config` by name, and
+    where `gamma` is not among them, the task's own is taken if the catalogue has one. With `resume` the run in `out`
+    goes on from its last checkpoint, under the config that it was started with.
 
     Raises `InputError` for anything that cannot work, before anything is written.
     """
     chosen = get_method(method)
-    config = resolve(chosen, configs.make(preset, **options), options)
+    spec = describe(task)
+    of_task = {} if spec.gamma is None else {"gamma": spec.gamma}
+    config = resolve(chosen, configs.make(preset, **of_task | options), options)
     if chosen.needs_logs and config.warm.warm_start == "none":
         config = configs.replace(config, warm_start="actor")
     folder = Path(out)
-    spec = describe(task)
     prior = _check_prior(chosen, prior, spec)
     logs = _check_logs(config, logs, spec)
     description = {
-        "task": task,
+        "task": spec.task,
         "method": chosen.name,
         "preset": preset,
         "config": configs.flatten(config),
