@@ -109,7 +109,7 @@ def _from_logs_to_runs(command: Command) -> None:
     _field_options(sub.add_argument_group("the diffusion prior"), DiffusionConfig)
 
     sub = command("train", commands.train_run, "Stage II: train a method on a task")
-    sub.add_argument("--task", required=True, metavar="ID", help="a Gymnasium id, such as Hopper-v5")
+    sub.add_argument("--task", required=True, metavar="ID", help="a Gymnasium id, such as Hopper-v5, or package.module:Class")
     sub.add_argument("--method", default="ppo-dap", help="see `ppo-dap methods` (default: %(default)s)")
     sub.add_argument("--prior", metavar="FILE", help="prior that `ppo-dap pretrain` wrote")
     _logs_option(sub, False)
