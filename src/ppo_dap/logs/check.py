@@ -107,7 +107,7 @@ def _spread(neighbours: Neighbours) -> Finding:
     if not len(neighbours.rows):
         return Finding("ok", name, "not checked: too few rows, or a single episode")
     spread, distance = float(neighbours.spread.mean()), float(np.median(neighbours.distance))
-    rows = f"{len(neighbours.rows)} rows, distance {distance:.2f} of any two rows'"
+    rows = f"{len(neighbours.rows)} rows compared, {distance:.2f} as far apart as any two"
     message = f"near states' actions have {spread:.0%} of the variance of all actions ({rows})"
     if spread <= SPREAD or distance > NEAR:
         return Finding("ok", name, message)

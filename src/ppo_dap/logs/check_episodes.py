@@ -35,7 +35,7 @@ def check_lengths(logs: Logs) -> Finding:
 def check_terminations(logs: Logs) -> Finding:
     """Terminations that look like timeouts."""
     if logs.terminated is None:
-        return Finding("ok", "terminations", "not logged")
+        return Finding("ok", "terminations", "not checked: no terminations logged")
     lengths, ended = logs.episode_lengths(), logs.terminated[logs.episode_ends]
     message = f"{ended.sum()} of {len(lengths)} episodes terminated, the others were cut off"
     longest = lengths == lengths.max()
@@ -50,7 +50,7 @@ def check_next_observations(logs: Logs) -> Finding:
     """Logged successors against the rows that follow."""
     name, following = "next observations", logs.next_observations
     if following is None:
-        return Finding("ok", name, "not logged, so not checked")
+        return Finding("ok", name, "not checked: none logged")
     ends = logs.episode_ends[:-1]
     same = np.empty(logs.num_rows - 1, bool)
     for start in range(0, len(same), CHUNK):
@@ -62,8 +62,10 @@ def check_next_observations(logs: Logs) -> Finding:
         return Finding("warning", name, f"{found}: log the final observation, or leave next_observations out")
     if broken:
         first = int(np.flatnonzero(~same & ~ends)[0])
-        found = f"{broken} rows inside episodes are not followed by their next observation, first row {first}"
-        return Finding("warning", name, f"{found}: episode ends are missing, or rows are shuffled or left out")
+        found = f"{broken} of {(~ends).sum()} rows are not followed by their next observation, first row {first}"
+        few = "episode ends are missing there, or rows were left out"
+        many = "rows are shuffled, or next observations are shifted or scaled in another way"
+        return Finding("warning", name, f"{found}: {few if broken < len(ends) / 2 else many}")
     return Finding("ok", name, f"each is the following row's observation, and none of {ends.sum()} crosses an end")
 
 
@@ -71,7 +73,7 @@ def check_time_step(logs: Logs) -> Finding:
     """Time stamps: do they rise, evenly, without gaps?"""
     name = "time step"
     if logs.times is None:
-        return Finding("ok", name, "no time stamps logged, so not checked")
+        return Finding("ok", name, "not checked: no time stamps logged")
     steps = np.diff(logs.times)[~logs.episode_ends[:-1]]
     if not len(steps):
         return Finding("ok", name, "every episode has a single row")
@@ -83,7 +85,7 @@ def check_time_step(logs: Logs) -> Finding:
         return Finding("warning", name, f"{found}: sort the rows by time, or mark the episode ends")
     gaps = int((steps > GAP * usual).sum())
     if gaps:
-        found = f"{message}, but {gaps} gaps, the longest {steps.max():.6g} s"
+        found = f"{message}, but {gaps} of {len(steps)} steps are gaps, the longest {steps.max():.6g} s"
         return Finding("warning", name, f"{found}: rows were dropped, so end an episode at each gap")
     uneven = float((np.abs(steps - usual) > 0.1 * usual).mean())
     if uneven > UNEVEN_SHARE:
@@ -96,7 +98,7 @@ def check_returns(logs: Logs) -> Finding:
     """Returns, and rewards that are error values."""
     returns = logs.episode_returns()
     if returns is None or logs.rewards is None:
-        return Finding("ok", "returns", "no rewards logged")
+        return Finding("ok", "returns", "not checked: no rewards logged")
     size = np.abs(logs.rewards)
     usual = float(np.quantile(size, 0.999 if len(size) > 2000 else 0.5))
     row = int(size.argmax())
@@ -113,8 +115,7 @@ def check_jumps(logs: Logs, jumps: Jumps) -> Finding:
     fitted = f"one-step model of {jumps.num_columns} columns, fitted to {jumps.num_fit_rows} steps"
     found = len(jumps.rows)
     if jumps.suspicious:
-        rows = columns(jumps.rows[:5]) + (", ..." if found > 5 else "")
-        what = f"the state jumps inside an episode after {found} rows, first after row {rows}"
+        what = f"the state jumps inside an episode after {found} rows: {columns(jumps.rows)}"
         advice = "mark these as truncated, or log the timeouts"
         return Finding("warning", "unmarked ends", f"{what}: {advice} ({fitted})")
     said = "none found" if not found else f"{found} of {logs.num_rows} rows, as few as heavy tails have"

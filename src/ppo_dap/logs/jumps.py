@@ -23,7 +23,7 @@ WEAK, NEAR, NEARER, COMBINED = 3.0, 0.5, 2.5, 8.0
 """A weaker mismatch, above `WEAK`, is a jump where it leads back to a known start: to within `NEAR` (usual deviations,
 90th percentile over columns), by a factor of at least `NEARER`, and `COMBINED` times the distance left is below the
 mismatch. Resets of HalfCheetah and Ant are 3 to 20 strong, as hard contacts are, but no contact led back to a start."""
-ONE_IN = 20_000
+ONE_IN = 10_000
 """Up to one found row in so many is no warning: heavy tails have such rows, and so few missing ends do no harm."""
 
 MIN_ROWS = 100
@@ -76,15 +76,19 @@ def find_jumps(logs: Logs) -> Jumps:
     candidates = inside[mismatch[inside] > WEAK]
     strength = mismatch[candidates]
     strong = (strength > STRONG) & (strength > ISOLATED * _around(mismatch, candidates))
-    starts = logs.observations[_known_starts(logs)]
-    before = model.distance(logs.observations[candidates], starts)
-    after = model.distance(logs.observations[candidates + 1], starts)
-    weak = (after < NEAR) & (before > NEARER * after) & (strength > COMBINED * after)
-    return Jumps(candidates[strong | weak], mismatch, model.num_changes, len(fit_rows))
+    found = candidates[strong]
+    for _ in range(2):  # what the first pass finds are more starts, where the second finds what landed near those
+        starts = logs.observations[_known_starts(logs, found)]
+        before = model.distance(logs.observations[candidates], starts)
+        after = model.distance(logs.observations[candidates + 1], starts)
+        weak = (after < NEAR) & (before > NEARER * after) & (strength > COMBINED * after)
+        found = candidates[strong | weak]
+    return Jumps(found, mismatch, model.num_changes, len(fit_rows))
 
 
-def _known_starts(logs: Logs) -> Int[np.ndarray, " starts"]:
-    starts = np.concatenate([[0], np.flatnonzero(logs.episode_ends[:-1]) + 1])
+def _known_starts(logs: Logs, found: Int[np.ndarray, " jumps"]) -> Int[np.ndarray, " starts"]:
+    """Some of the rows that start an episode, marked or found."""
+    starts = np.unique(np.concatenate([[0], np.flatnonzero(logs.episode_ends[:-1]) + 1, found + 1]))
     return starts[np.linspace(0, len(starts) - 1, min(MAX_STARTS, len(starts))).astype(int)]
 
 
@@ -116,8 +120,8 @@ class _Columns:
         scale = (high - low) / 2.563
         return _Columns(np.flatnonzero((scale > 1e-7) & (three - quarter > 0.135 * scale)), middle, scale)
 
-    def keep(self, which: Int[np.ndarray, " kept"]) -> _Columns:
-        return _Columns(np.sort(self.used[which]), self.middle, self.scale)
+    def only(self, chosen: Int[np.ndarray, " chosen"]) -> _Columns:
+        return _Columns(np.intersect1d(self.used, chosen), self.middle, self.scale)
 
     def __call__(self, values: Float[np.ndarray, "rows columns"], most: float) -> Float[np.ndarray, "rows used"]:
         """Standardised float64 values, cut at `most` deviations so that no single column drowns the others."""
@@ -189,11 +193,11 @@ def _best(
     move = changes(change, 3.0)
     correlation = _unit(move).T @ _unit(middle)
     if not correlation.size:
-        return states, changes.keep(np.arange(min(most, len(changes.used))))
+        return states, changes.only(changes.used[:most])
     order = np.argsort(-np.abs(correlation).max(1), kind="stable")[: max(1, most // 2)]
     partners = np.abs(correlation[order]).argmax(1)
     chosen = np.union1d(changes.used[order], states.used[partners])
-    return states.keep(np.isin(states.used, chosen)), changes.keep(np.isin(changes.used, chosen))
+    return states.only(chosen), changes.only(chosen)
 
 
 def _unit(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:

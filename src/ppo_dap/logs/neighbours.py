@@ -44,7 +44,7 @@ class Mixture:
 
     `share`: of the action's variance, what the episode accounts for at a given state; `p_value`: of a permutation test
     that pairs the first halves of episodes with other episodes' second halves; `halves` (2, episodes): the
-    residuals' mean of each half along the direction that differs most.
+    residuals' mean of each half along the direction in which the halves agree most.
     """
 
     share: float
@@ -118,6 +118,8 @@ def find_mixture(logs: Logs, neighbours: Neighbours) -> Mixture | None:
     which first one would not matter, so the p-value is uniform up to the neighbours' bias (nearly the same states are
     not the same). `share` says whether what differs matters.
     """
+    if not len(neighbours.rows):
+        return None
     episode, second = _places(logs, neighbours.rows)
     # A difference may change sign from state to state: the residual is also weighed by the leading state components.
     weights = np.concatenate([np.ones((len(episode), 1)), np.clip(neighbours.states[:, :3], -3, 3)], axis=1)
@@ -138,10 +140,11 @@ def find_mixture(logs: Logs, neighbours: Neighbours) -> Mixture | None:
     rng = np.random.default_rng(SEED)
     # Every pairing of halves is a sum of entries of one matrix.
     product = first @ last.T
-    drawn = [product[np.arange(len(both)), rng.permutation(len(both))].sum() for _ in range(PERMUTATIONS)]
-    p_value = (1 + sum(value >= observed for value in drawn)) / (1 + PERMUTATIONS)
+    pairings = rng.permuted(np.tile(np.arange(len(both)), (PERMUTATIONS, 1)), axis=1)
+    drawn = product[np.arange(len(both)), pairings].sum(1)
+    p_value = float(1 + (drawn >= observed).sum()) / (1 + PERMUTATIONS)
     covariance = (means[0] * means[1]).mean(0).reshape(logs.action_size, -1)
     share = float(np.maximum(covariance, 0).sum(1).mean())
-    joint = np.concatenate([first, last])
-    direction = np.linalg.svd(joint, full_matrices=False)[2][0]
+    cross = first.T @ last
+    direction = np.linalg.eigh(cross + cross.T)[1][:, -1]
     return Mixture(share, p_value, np.stack([first @ direction, last @ direction]))

@@ -58,7 +58,8 @@ def draw_all(logs: Logs, report: Report, low: np.ndarray | None, high: np.ndarra
     if report.mixture is not None:
         caption = (
             "One point an episode: how its actions differ from those of near states in other episodes, in its first "
-            "half and in its second. One policy gives a round cloud; several, a cloud along the diagonal, or heaps."
+            "half and in its second, along the direction in which the halves agree most. One policy gives a shapeless "
+            "cloud; several, a cloud along the dotted diagonal, or heaps on it."
         )
         yield _draw("Mixture of policies", caption, _mixture, report.mixture)
 
@@ -122,9 +123,8 @@ def _mismatch(figure: Any, jumps: Jumps) -> None:
     axes.semilogy(np.flatnonzero(shown) * width, largest[shown], ".", color=BLUE, markersize=2)
     axes.semilogy(jumps.rows, jumps.mismatch[jumps.rows], "x", color=RED, markersize=6)
     axes.axhline(STRONG, color=GREY, linestyle=":")
-    unit = "" if width == 1 else f", largest of every {width} rows"
-    axes.set(xlabel="row", ylabel=f"mismatch (times the usual{unit})")
-    axes.yaxis.label.set_size(8)
+    unit = "row" if width == 1 else f"row (a point is the largest of {width} rows)"
+    axes.set(xlabel=unit, ylabel="mismatch (times the usual)")
 
 
 def _trajectories(figure: Any, logs: Logs, jumps: Jumps | None) -> None:

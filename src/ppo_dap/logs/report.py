@@ -12,7 +12,7 @@ from jaxtyping import Float32
 
 from ppo_dap.errors import InputError
 from ppo_dap.logs.dataset import Logs
-from ppo_dap.logs.finding import EXIT_CODES, Report
+from ppo_dap.logs.finding import EXIT_CODES, Finding, Report
 from ppo_dap.storage import write_atomically
 
 MARKS = {"error": "✕ error", "warning": "! warning", "ok": "✓ ok"}
@@ -25,10 +25,13 @@ body { font: 16px/1.5 system-ui, sans-serif; color: var(--text); background: var
   margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.6rem; line-height: 1.25; overflow-wrap: anywhere; } h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; }
 p.soft, figcaption { color: var(--soft); } .error { color: var(--error); } .warning { color: var(--warning); }
-.ok { color: var(--ok); } .level { font-weight: 600; white-space: nowrap; }
+.ok { color: var(--ok); } .level { font-weight: 600; } .skipped { color: var(--soft); font-weight: 400; }
 .table { overflow-x: auto; } table { border-collapse: collapse; width: 100%; }
 th, td { text-align: left; vertical-align: top; padding: 0.4rem 0.8rem 0.4rem 0; border-bottom: 1px solid var(--line); }
 td { overflow-wrap: anywhere; } td:nth-child(-n+2) { overflow-wrap: normal; white-space: nowrap; }
+@media (max-width: 40rem) { tr:first-child { display: none; } tr { display: block; padding: 0.5rem 0;
+  border-bottom: 1px solid var(--line); }
+  td { display: inline; border: 0; } td:last-child { display: block; } }
 figure { margin: 0; } img { max-width: 100%; height: auto; background: #fff; border-radius: 6px; display: block; }
 """
 VERDICTS = ("usable, nothing odd found", "usable, but look at the warnings", "unusable as they are")
@@ -68,7 +71,8 @@ def _page(logs: Logs, report: Report, low: np.ndarray | None, high: np.ndarray |
     from ppo_dap.logs.pictures import draw_all
 
     title = html.escape(f"check-logs: {Path(logs.source).name}")
-    size = f"{logs.num_rows:,} rows, {logs.num_episodes:,} episodes, task {logs.task or 'unknown'}"
+    size = html.escape(f"{logs.num_rows:,} rows, {logs.num_episodes:,} episodes, task {logs.task or 'unknown'}")
+    size += f"<br>{html.escape(logs.source)}" if Path(logs.source).name != logs.source else ""
     levels = [line.level for line in report.lines]
     counts = ", ".join(f"{levels.count(level)} {word}" for level, word in _words(levels) if levels.count(level))
     worst = max(EXIT_CODES, key=lambda level: EXIT_CODES[level] * (level in levels))
@@ -89,7 +93,7 @@ def _page(logs: Logs, report: Report, low: np.ndarray | None, high: np.ndarray |
 </head>
 <body>
 <h1>{title}</h1>
-<p class="soft">{html.escape(size)}<br>{html.escape(logs.source)}</p>
+<p class="soft">{size}</p>
 <p class="level {worst}">{VERDICTS[report.exit_code].capitalize()} ({counts}).</p>
 <div class="table"><table>
 <tr><th>level</th><th>check</th><th>finding</th></tr>
@@ -105,10 +109,23 @@ def _words(levels: list[str]) -> list[tuple[str, str]]:
     return [(level, level + "s" * (level != "ok" and levels.count(level) != 1)) for level in reversed(EXIT_CODES)]
 
 
+def _skipped(line: Finding) -> bool:
+    # A check without what it needs is no warning, but no tick either.
+    return line.message.startswith("not checked")
+
+
+def _look(line: Finding) -> str:
+    return "level skipped" if _skipped(line) else f"level {line.level}"
+
+
+def _mark(line: Finding) -> str:
+    return "- not checked" if _skipped(line) else MARKS[line.level]
+
+
 def _rows(report: Report) -> str:
     worst_first = sorted(report.lines, key=lambda line: -EXIT_CODES[line.level])
     return "\n".join(
-        f'<tr><td class="level {line.level}">{MARKS[line.level]}</td><td>{html.escape(line.name)}</td>'
+        f'<tr><td class="{_look(line)}">{_mark(line)}</td><td>{html.escape(line.name)}</td>'
         f"<td>{html.escape(line.message)}</td></tr>"
         for line in worst_first
     )
