@@ -99,6 +99,7 @@ def _from_logs_to_runs(command: Command) -> None:
     _logs_option(sub, True)
     sub.add_argument("--task", metavar="ID", help="task to check dimensions and bounds against")
     sub.add_argument("--json", action="store_true", help="print the findings as JSON")
+    sub.add_argument("--html", metavar="FILE", help="write the findings and pictures to one .html file as well")
 
     sub = command("pretrain", commands.pretrain, "Stage I: fit the diffusion prior to logs")
     _logs_option(sub, True)

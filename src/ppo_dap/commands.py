@@ -28,20 +28,29 @@ def quickstart(options: argparse.Namespace) -> int:
 def check_logs(options: argparse.Namespace) -> int:
     """The verdict on logs; exit code 0, 1 (warnings) or 2 (unusable)."""
     from ppo_dap import logs as logs_package
+    from ppo_dap.logs.report import require_html
 
-    logs = logs_package.load_logs(options.logs, options.task)
-    against: dict[str, Any] = {}
-    if logs.task is not None:
+    if options.html is not None:
+        require_html(options.html)
+    logs = logs_package.load_logs(options.logs)
+    task = options.task or logs.task
+    bounds: dict[str, Any] = {}
+    against: dict[str, Any] = {"task": options.task}
+    if task is not None:
         from ppo_dap.tasks import describe
 
-        spec = describe(logs.task)
-        against = {"action_low": spec.action_low, "action_high": spec.action_high}
+        spec = describe(task)
+        bounds = {"action_low": spec.action_low, "action_high": spec.action_high}
         against["observation_size"] = spec.observation_size
-    report = logs_package.check_logs(logs, **against)
+    report = logs_package.check_logs(logs, **against, **bounds)
+    if options.html is not None:
+        logs_package.write_report(logs, report, options.html, **bounds)
     if options.json:
         print(json.dumps([dataclasses.asdict(finding) for finding in report.lines]))
     else:
         print(report)
+        if options.html is not None:
+            print(f"report: {options.html}")
     return report.exit_code
 
 

@@ -97,3 +97,28 @@ def fails(source, match):
         load_logs(source)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def level(report, name):
+    return next(line for line in report.lines if line.name == name).level
+
+
+def message(report, name):
+    return next(line for line in report.lines if line.name == name).message
+
+
+def pendulums(num_episodes=30, length=60, seed=0):
+    """Three driven pendulums, semi-implicit Euler, reset near rest: D4RL arrays with every timeout marked."""
+    rng = np.random.default_rng(seed)
+    arrays = {"observations": [], "actions": [], "timeouts": []}
+    for _ in range(num_episodes):
+        angle, speed = rng.normal(0, 0.1, 3), rng.normal(0, 0.1, 3)
+        for t in range(length):
+            action = np.clip(np.sin(0.2 * t + np.arange(3)) + 0.3 * rng.normal(size=3), -1, 1)
+            arrays["observations"].append(np.concatenate([angle, speed]))
+            arrays["actions"].append(action)
+            arrays["timeouts"].append(t == length - 1)
+            for _ in range(5):
+                speed = speed + 0.01 * (20 * action - 9.8 * np.sin(angle) - 0.1 * speed)
+                angle = angle + 0.01 * speed
+    return {name: np.array(values) for name, values in arrays.items()}

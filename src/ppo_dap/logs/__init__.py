@@ -1,9 +1,11 @@
 """D_off, the logged trajectories: reading, checking, splitting and writing them. Knows nothing of learning."""
 
-from ppo_dap.logs.check import Finding, Report, check_logs, require_compatible
+from ppo_dap.logs.check import check_logs, require_compatible
 from ppo_dap.logs.dataset import Logs, LogsWarning
+from ppo_dap.logs.finding import Finding, Report
 from ppo_dap.logs.formats import load_logs, sample_names
 from ppo_dap.logs.npz import save_npz
+from ppo_dap.logs.report import write_report
 
 __all__ = [
     "Finding",
@@ -15,4 +17,5 @@ __all__ = [
     "require_compatible",
     "sample_names",
     "save_npz",
+    "write_report",
 ]

@@ -10,6 +10,8 @@ from jaxtyping import Float32, Int
 from ppo_dap.errors import InputError
 
 ARRAY_FIELDS = ("observations", "actions", "episode_ends", "rewards", "terminated", "action_low", "action_high")
+LATER_FIELDS = ("next_observations", "times")
+"""Hashed only where they are there, so that the hash of logs without them stays what it was."""
 
 
 class LogsWarning(UserWarning):
@@ -17,10 +19,15 @@ class LogsWarning(UserWarning):
 
 
 def as_float32(name: str, value: object, axes: tuple[str, ...], finite: bool = True) -> np.ndarray:
-    """`value` as a float32 array with the given axes; integers and other floats are converted.
+    """`as_numbers` in float32, the dtype of all that is learned from."""
+    return as_numbers(name, value, axes, np.float32, finite)
 
-    Raises `InputError` for another dtype or number of axes, and for the first entry that is not finite as float32
-    (`finite=False` lets infinities pass, as bounds may be infinite, but never NaN).
+
+def as_numbers(name: str, value: object, axes: tuple[str, ...], dtype: type, finite: bool = True) -> np.ndarray:
+    """`value` as an array of `dtype` with the given axes; integers and other floats are converted.
+
+    Raises `InputError` for another kind of dtype or number of axes, and for the first entry that is not finite in
+    `dtype` (`finite=False` lets infinities pass, as bounds may be infinite, but never NaN).
     """
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
@@ -30,12 +37,13 @@ def as_float32(name: str, value: object, axes: tuple[str, ...], finite: bool = T
         hint = f", so ({array.size}, 1) if it is a single column" if array.ndim == 1 else ""
         raise InputError(f"{name} has shape {array.shape}: must be {right}{hint}")
     with np.errstate(over="ignore"):  # an overflow becomes inf and is reported below with its place
-        converted = np.ascontiguousarray(array, dtype=np.float32)
+        converted = np.ascontiguousarray(array, dtype=dtype)
     bad = ~np.isfinite(converted) if finite else np.isnan(converted)
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         place = ", ".join(f"{axis} {i}" for axis, i in zip(("row", "column"), index, strict=False))
-        raise InputError(f"{name} is {array[index]} at {place} ({bad.sum()} such values): must be finite in float32")
+        found = f"{name} is {array[index]} at {place} ({bad.sum()} such values)"
+        raise InputError(f"{found}: must be finite in {np.dtype(dtype)}")
     return converted
 
 
@@ -86,6 +94,10 @@ class Logs:
     """float32 (act,), upper bounds of the action space, above `action_low`; may be inf."""
     source: str = "memory"
     """Where the logs came from, for messages; no part of the hash."""
+    next_observations: np.ndarray | None = None
+    """float32 (rows, obs), the true successor of each observation, finite; used by `check_logs` alone."""
+    times: np.ndarray | None = None
+    """float64 (rows,), time stamps in seconds, finite; used by `check_logs` alone."""
 
     def __post_init__(self):
         values = {
@@ -97,12 +109,20 @@ class Logs:
             values["rewards"] = as_float32("rewards", self.rewards, ("rows",))
         if self.terminated is not None:
             values["terminated"] = as_flags("terminated", self.terminated)
+        if self.next_observations is not None:
+            values["next_observations"] = as_float32("next_observations", self.next_observations, ("rows", "obs"))
+        if self.times is not None:
+            values["times"] = as_numbers("times", self.times, ("rows",), np.float64)
         rows = len(values["observations"])
         for name in ("observations", "actions"):
             if 0 in values[name].shape:
                 raise InputError(f"{name} has shape {values[name].shape}: must have at least one row and one column")
         for name, array in values.items():
             require_rows(name, array, rows)
+        following = values.get("next_observations")
+        if following is not None and following.shape != values["observations"].shape:
+            found = f"{following.shape[1]} columns but observations has {values['observations'].shape[1]}"
+            raise InputError(f"next_observations has {found}: must be equal")
         _check_ends(values["episode_ends"], values.get("terminated"))
         values.update(_bounds(self.action_low, self.action_high, values["actions"].shape[1]))
         if self.task is not None and not (isinstance(self.task, str) and self.task.strip()):
@@ -206,7 +226,7 @@ class Logs:
     def hash(self) -> str:
         """Sha256 (hex) over names, shapes, dtypes and bytes of the arrays and over the task; `source` is left out."""
         digest = hashlib.sha256()
-        for name in ARRAY_FIELDS:
+        for name in (*ARRAY_FIELDS, *(name for name in LATER_FIELDS if getattr(self, name) is not None)):
             array = getattr(self, name)
             if array is None:
                 digest.update(f"{name}:none;".encode())
@@ -221,7 +241,7 @@ class Logs:
         """The given rows; the last of them ends an episode even where a cut made it the last."""
         ends = self.episode_ends[rows].copy()
         ends[-1] = True
-        optional = {name: getattr(self, name) for name in ("rewards", "terminated")}
+        optional = {name: getattr(self, name) for name in ("rewards", "terminated", *LATER_FIELDS)}
         taken = {name: None if array is None else array[rows] for name, array in optional.items()}
         return replace(
             self, observations=self.observations[rows], actions=self.actions[rows], episode_ends=ends, **taken

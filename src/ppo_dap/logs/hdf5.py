@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ppo_dap.errors import InputError
-from ppo_dap.logs.dataset import Logs, LogsWarning
+from ppo_dap.logs.dataset import LATER_FIELDS, Logs, LogsWarning
 from ppo_dap.logs.reading import assemble, reading, refuse_large
 
-D4RL_UNUSED = ("next_observations", "next_actions", "infos", "metadata")
+D4RL_UNUSED = ("next_actions", "infos", "metadata")
 
 
 @contextmanager
@@ -52,6 +52,8 @@ def is_minari(file: Any) -> bool:
 def read_d4rl(path: Path) -> Logs:
     """Read D4RL's flat arrays: `observations`, `actions`, and `rewards`, `terminals`, `timeouts` if there.
 
+    `next_observations` and `times` (seconds) are kept too.
+
     Warns with `LogsWarning` about keys that are not of the layout. Raises `InputError` in one line.
     """
     with open_hdf5(path) as file:
@@ -60,6 +62,7 @@ def read_d4rl(path: Path) -> Logs:
             found = ", ".join(sorted(file)) or "nothing"
             raise InputError(f"has no {' and no '.join(missing)} (found {found}): must have observations and actions")
         wanted = {"rewards": "rewards", "terminals": "terminated", "timeouts": "truncated"}
+        wanted |= {name: name for name in LATER_FIELDS}
         known = ("observations", "actions", *wanted, *D4RL_UNUSED)
         strange = sorted(set(file) - set(known))
         if strange:

@@ -39,7 +39,7 @@ def read_minari_id(dataset_id: str) -> Logs:
 
 
 def read_minari(folder: Path) -> Logs:
-    """Read a Minari dataset folder, hdf5 or arrow. Each episode's T+1 observations lose the last one.
+    """Read a Minari dataset folder, hdf5 or arrow: T+1 observations become T states and their successors.
 
     Raises `InputError` in one line, naming the episode, for Dict or Tuple spaces, discrete actions and damaged files.
     """
@@ -123,7 +123,8 @@ def _episode(name: str, stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for key in names:
         if len(stored[key]) != rows:
             raise InputError(f"{name} has {len(stored[key])} {key} and {rows} actions: both must be equal")
-    return {"observations": stored["observations"][:-1], **{field: stored[key] for key, field in names.items()}}
+    states = {"observations": stored["observations"][:-1], "next_observations": stored["observations"][1:]}
+    return {**states, **{field: stored[key] for key, field in names.items()}}
 
 
 def _join(name: str, episodes: list[dict[str, np.ndarray]]) -> np.ndarray:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from ppo_dap.errors import InputError, unknown
-from ppo_dap.logs.dataset import Logs
+from ppo_dap.logs.dataset import LATER_FIELDS, Logs
 from ppo_dap.logs.reading import assemble, reading, refuse_large
 from ppo_dap.storage import write_atomically
 
 ALIASES = {"terminals": "terminated", "timeouts": "truncated"}
 KEYS = (
-    *("observations", "actions", "rewards", "terminated", "truncated", "episode_id", "next_observations"),
+    *("observations", "actions", "rewards", "terminated", "truncated", "episode_id", "next_observations", "times"),
     *("task", "action_low", "action_high", *ALIASES),
 )
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip can hold; a real one would change the bytes
@@ -38,7 +38,6 @@ def read_npz(path: Path) -> Logs:
         missing = [name for name in ("observations", "actions") if name not in arrays]
         if missing:
             raise InputError(f"has no {' and no '.join(missing)}: must have observations and actions")
-        arrays.pop("next_observations", None)
         task = arrays.pop("task", None)
         if task is not None and (task.ndim != 0 or task.dtype.kind != "U"):
             raise InputError(f"task has shape {task.shape} and dtype {task.dtype}: must be one string")
@@ -96,7 +95,7 @@ def save_npz(logs: Logs, path: str | os.PathLike) -> None:
     arrays = {"observations": logs.observations, "actions": logs.actions}
     # The episode's number marks ends without a claim about why an episode ended.
     arrays["episode_id"] = np.cumsum(logs.episode_ends, dtype=np.int32) - logs.episode_ends.astype(np.int32)
-    for name in ("rewards", "terminated", "action_low", "action_high"):
+    for name in ("rewards", "terminated", "action_low", "action_high", *LATER_FIELDS):
         if getattr(logs, name) is not None:
             arrays[name] = getattr(logs, name)
     if logs.task is not None:

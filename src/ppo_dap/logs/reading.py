@@ -60,6 +60,8 @@ def assemble(
     task: str | None = None,
     action_low: np.ndarray | None = None,
     action_high: np.ndarray | None = None,
+    next_observations: np.ndarray | None = None,
+    times: np.ndarray | None = None,
 ) -> Logs:
     """Build `Logs`; an episode ends at terminated | truncated | a change of `episode_id` | the last row.
 
@@ -85,4 +87,5 @@ def assemble(
         message = "nothing marks an episode's end, so all rows count as one episode; add truncated or episode_id"
         warnings.warn(f"{path}: {message}", LogsWarning, stacklevel=4)
     ends[-1] = True
-    return Logs(observations, actions, ends, rewards, terminated, task, action_low, action_high, str(path))
+    fields = (rewards, terminated, task, action_low, action_high, str(path), next_observations, times)
+    return Logs(observations, actions, ends, *fields)
