@@ -105,12 +105,15 @@ def _from_logs_to_runs(command: Command) -> None:
     _logs_option(sub, True)
     sub.add_argument("--task", metavar="ID", help="task of the logs, where they do not say (gives the action bounds)")
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
-    sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit (default: 0)")
+    sub.add_argument("--coverage", default="wide", help="wide, medium or narrow: how much of the logs (default: wide)")
+    sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit, and of the coverage (default: 0)")
     sub.add_argument("--quiet", action="store_true", help="print the result alone")
     _field_options(sub.add_argument_group("the diffusion prior"), DiffusionConfig)
 
     sub = command("train", commands.train_run, "Stage II: train a method on a task")
-    sub.add_argument("--task", required=True, metavar="ID", help="a Gymnasium id, such as Hopper-v5, or package.module:Class")
+    sub.add_argument(
+        "--task", required=True, metavar="ID", help="a Gymnasium id, such as Hopper-v5, or package.module:Class"
+    )
     sub.add_argument("--method", default="ppo-dap", help="see `ppo-dap methods` (default: %(default)s)")
     sub.add_argument("--prior", metavar="FILE", help="prior that `ppo-dap pretrain` wrote")
     _logs_option(sub, False)
@@ -128,6 +131,7 @@ def _about_runs(command: Command) -> None:
     sub.add_argument("--task", metavar="ID", help="another task of the same dimensions")
     sub.add_argument("--episodes", type=_positive_count, default=10, help="(default: %(default)s)")
     sub.add_argument("--seed", type=_seed, default=0, help="seed of the environments (default: 0)")
+    sub.add_argument("--video", metavar="FILE", help="film an episode of its own to this .mp4 as well")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
     sub = command("bench", commands.bench, "what PPO and the method cost on this machine, as ratios; tens of minutes")
@@ -153,16 +157,33 @@ def _about_runs(command: Command) -> None:
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
 
-    sub = command("collect", commands.collect, "log episodes of a run's policy")
-    sub.add_argument("folder", metavar="RUN", help="run folder")
-    sub.add_argument("--out", required=True, metavar="FILE", help=".npz to write")
+    sub = command("collect", commands.collect, "log episodes of a run's policy, or make tiers of logs for a task")
+    sub.add_argument("folder", nargs="?", metavar="RUN", help="run folder, to log its policy")
+    sub.add_argument("--task", action="append", metavar="ID", help="or train behaviour policies for it; again for more")
+    sub.add_argument(
+        "--tier",
+        action="append",
+        metavar="TIER",
+        help="random, medium, medium-replay, medium-expert, expert or mixed; again for more (default: medium)",
+    )
+    sub.add_argument(
+        "--all", action="store_true", help="medium, medium-replay and medium-expert for all tasks of the paper"
+    )
+    sub.add_argument("--out", required=True, metavar="PATH", help=".npz to write; for tiers the folder they go to")
     sub.add_argument(
         "--steps", type=_positive_count, default=100_000, help="rows at least, in whole episodes (default: %(default)s)"
     )
-    sub.add_argument("--seed", type=_seed, default=0, help="seed of environments and noise (default: 0)")
     sub.add_argument(
-        "--noise", type=_number_of_0_or_more, default=1.0, help="times the policy's own noise (default: %(default)s)"
+        "--train-steps", type=_positive_count, default=1_000_000, help="of a behaviour run (default: %(default)s)"
     )
+    sub.add_argument("--seed", type=_seed, default=0, help="seed of training, environments and noise (default: 0)")
+    sub.add_argument(
+        "--noise",
+        type=_number_of_0_or_more,
+        default=1.0,
+        help="times the policy's own noise, for a RUN (default: %(default)s)",
+    )
+    sub.add_argument("--json", action="store_true", help="print JSON")
 
     sub = command("methods", commands.methods, "the methods and what each of them uses (Table 3)")
     sub.add_argument("--json", action="store_true", help="print JSON")

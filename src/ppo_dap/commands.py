@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import itertools
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -60,9 +61,10 @@ def pretrain(options: argparse.Namespace) -> int:
     given = {f.name: getattr(options, f.name) for f in dataclasses.fields(DiffusionConfig) if f.name in options}
     DiffusionConfig(**given)  # a bad option is told before JAX is imported
     from ppo_dap.logs import load_logs
+    from ppo_dap.logs.coverage import cover, coverage_statistics
     from ppo_dap.priors import fit_prior
 
-    logs = load_logs(options.logs, options.task)
+    logs = cover(load_logs(options.logs, options.task), options.coverage, options.seed)
     bounds: dict[str, Any] = {}
     if logs.task is not None:
         from ppo_dap.logs import require_compatible
@@ -72,6 +74,10 @@ def pretrain(options: argparse.Namespace) -> int:
         sizes = {"observation_size": spec.observation_size, "action_size": spec.action_size}
         require_compatible(logs, task=logs.task, **sizes)
         bounds = {"action_low": spec.action_low, "action_high": spec.action_high}
+
+    if options.coverage != "wide" and not options.quiet:
+        kept = ", ".join(f"{name} {value:,.4g}" for name, value in coverage_statistics(logs).items())
+        print(f"coverage {options.coverage}: {kept}", file=sys.stderr)
 
     def show(p: Any) -> None:
         print(
@@ -140,8 +146,11 @@ def evaluate(options: argparse.Namespace) -> int:
     prepare_jax()
     from ppo_dap.training.evaluation import evaluate_policy
     from ppo_dap.training.run import load_run
+    from ppo_dap.training.video import record_video, require_video
 
     run = load_run(options.folder)
+    if options.video is not None:
+        require_video(options.video)
     task = options.task or run.config["task"]
     row = evaluate_policy(run.policy, task, options.episodes, options.seed).row(run.evaluations[-1]["env_steps"])
     if options.json:
@@ -151,6 +160,9 @@ def evaluate(options: argparse.Namespace) -> int:
             f"{task}: return {row['return_mean']:,.1f} +- {row['return_std']:,.1f} over {row['episodes']} episodes, "
             f"length {row['length_mean']:,.0f}"
         )
+    if options.video is not None:
+        frames = record_video(run.policy, task, options.video, options.seed)
+        print(f"{options.video}: {frames} frames", file=sys.stderr)
     return 0
 
 
@@ -204,8 +216,12 @@ def summary(options: argparse.Namespace) -> int:
 
 
 def collect(options: argparse.Namespace) -> int:
-    """Logs of a run's policy."""
+    """Logs of a run's policy, or tiers of logs by behaviour policies that are trained for them."""
     prepare_jax()
+    if options.folder is None:
+        return _collect_tiers(options)
+    if options.task or options.tier or options.all:
+        raise InputError(f"RUN {options.folder} is logged as it is: leave --task, --tier and --all out")
     from ppo_dap.logs import save_npz
     from ppo_dap.training.collect import collect_logs
     from ppo_dap.training.run import load_run
@@ -215,10 +231,40 @@ def collect(options: argparse.Namespace) -> int:
     save_npz(logs, options.out)
     summary = logs.episode_returns()
     assert summary is not None  # collected logs have rewards
-    print(
-        f"{options.out}: {logs.num_rows:,} rows, {logs.num_episodes} episodes, return {summary.mean():,.0f}, "
-        f"sha256 {logs.hash()}"
-    )
+    row = {"out": options.out, "rows": logs.num_rows, "episodes": logs.num_episodes}
+    row |= {"return": float(summary.mean()), "sha256": logs.hash()}
+    if options.json:
+        print(json.dumps(row))
+    else:
+        print("{out}: {rows:,} rows, {episodes} episodes, return {return:,.0f}, sha256 {sha256}".format(**row))
+    return 0
+
+
+def _collect_tiers(options: argparse.Namespace) -> int:
+    from ppo_dap.tasks import CATALOGUE, describe
+    from ppo_dap.training import tiers
+
+    if options.all and (options.task or options.tier):
+        raise InputError("--all says which tasks and tiers: leave --task and --tier out")
+    tasks = list(CATALOGUE) if options.all else options.task or []
+    wanted = ["medium", "medium-replay", "medium-expert"] if options.all else options.tier or ["medium"]
+    if not tasks:
+        raise InputError("nothing to log: name a RUN, a --task, or --all")
+    tiers.check_tiers(wanted)
+    tasks = [describe(task).task for task in tasks]
+    folder, rows = Path(options.out), []
+    request = {"rows": options.steps, "seed": options.seed, "steps": options.train_steps, "folder": folder}
+    plan = {task: tiers.estimate(task, wanted, **request) for task in tasks}
+    for task, seconds in plan.items():
+        print(f"{task}: {', '.join(wanted)}: about {seconds / 60:.0f} min", file=sys.stderr)
+    print(f"in all about {sum(plan.values()) / 60:.0f} min on one core; what is there already is kept", file=sys.stderr)
+    for task, tier in itertools.product(tasks, wanted):
+        rows.append(row := tiers.make_tier(task, tier, **request))
+        if not options.json:
+            text = "{out}: {rows:,} rows, {episodes:,} episodes, return {return:,.1f}, sha256 {sha256}"
+            print(text.format(**row), flush=True)
+    if options.json:
+        print(json.dumps(rows))
     return 0
 
 

@@ -164,6 +164,8 @@ class RunConfig:
     thread wakes no other core."""
     tensorboard: bool = True
     """Write TensorBoard event files."""
+    keep_history: bool = False
+    """Keep each iteration's rollout and each evaluation's policy, for `ppo-dap collect`."""
 
 
 @dataclass(frozen=True)

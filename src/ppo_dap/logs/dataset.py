@@ -202,7 +202,7 @@ class Logs:
         if outside.size:
             raise InputError(f"episode_indices has {outside[0]}: must lie in 0 to {self.num_episodes - 1}")
         slices = self.episode_slices()
-        return self._take(np.concatenate([np.arange(slices[i].start, slices[i].stop) for i in indices]))
+        return self.take(np.concatenate([np.arange(slices[i].start, slices[i].stop) for i in indices]))
 
     def split(self, validation_fraction: float = 0.1, seed: int = 0) -> tuple["Logs", "Logs"]:
         """(train, validation): about `validation_fraction` of the episodes, drawn by `seed`, go to validation.
@@ -219,7 +219,7 @@ class Logs:
         held_out = min(max(round(validation_fraction * units), 1), units - 1)
         if self.num_episodes == 1:
             cut = self.num_rows - held_out
-            return self._take(np.arange(cut)), self._take(np.arange(cut, self.num_rows))
+            return self.take(np.arange(cut)), self.take(np.arange(cut, self.num_rows))
         order = np.random.default_rng(seed).permutation(units)
         return self.select(np.sort(order[held_out:])), self.select(np.sort(order[:held_out]))
 
@@ -237,7 +237,7 @@ class Logs:
         digest.update(f"task:{self.task!r}".encode())
         return digest.hexdigest()
 
-    def _take(self, rows: np.ndarray) -> "Logs":
+    def take(self, rows: Int[np.ndarray, "taken"]) -> "Logs":
         """The given rows; the last of them ends an episode even where a cut made it the last."""
         ends = self.episode_ends[rows].copy()
         ends[-1] = True

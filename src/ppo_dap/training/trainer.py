@@ -32,6 +32,7 @@ from ppo_dap.training.clock import Clock
 from ppo_dap.training.cores import pinned
 from ppo_dap.training.draws import Draws, draw, num_parts
 from ppo_dap.training.evaluation import evaluate_policy
+from ppo_dap.training.history import History
 from ppo_dap.training.recording import Progress, Recorder
 from ppo_dap.training.state import TrainState, save_checkpoint
 
@@ -70,12 +71,15 @@ class Trainer:
     """Called before the first iteration: waits until the stages are compiled."""
     clock: Clock = field(default_factory=Clock, init=False)
     interrupted: bool = field(default=False, init=False)
+    history: History | None = field(init=False)
     _pending: Pending | None = field(default=None, init=False)
     _next_draws: tuple[int, Draws] | None = field(default=None, init=False)
     _recorded_steps: int = field(init=False)
     _last_return: float | None = field(default=None, init=False)
+    _segment_start: int = field(default=0, init=False)
 
     def __post_init__(self):
+        self.history = History(self.folder) if self.config.run.keep_history else None
         self._recorded_steps = self.state.env_steps
 
     def run(self) -> None:
@@ -101,6 +105,7 @@ class Trainer:
         Environments start anew with each segment, so that a resumed run sees what an uninterrupted one does.
         """
         config, state = self.config.run, self.state
+        self._segment_start = state.iteration
         seed = _seed(config.seed, ENV_STREAM, state.iteration)
         state.reward_scale = state.reward_scale.restart()
         env = make_vector_env(self.spec.task, self.config.ppo.num_envs, seed, config.threads)
@@ -142,6 +147,8 @@ class Trainer:
             self._next_draws = state.iteration + 1, self._draws(state.iteration + 1)
         with self.clock.host("recording"):
             self.settle()
+            if self.history is not None:
+                self.history.keep_rollout(state.iteration, self._segment_start, parts, self.spec)
         state.iteration, state.env_steps = row["iteration"], row["env_steps"]
         with self.clock.host("waiting"):
             jax.block_until_ready(state.learner.ppo.actor)
@@ -247,6 +254,8 @@ class Trainer:
         result = evaluate_policy(policy, self.spec.task, config.eval_episodes, seed, config.threads)
         row = result.row(state.env_steps)
         self.recorder.add("evaluations", row)
+        if self.history is not None:
+            self.history.keep_policy(state.env_steps, policy)
         if row["return_mean"] > state.best_return:
             state.best_return = row["return_mean"]
             self.checkpoint("best")

@@ -1,0 +1,114 @@
+"""Coverage levels (5.6): what each keeps, held against counts made by hand."""
+
+import numpy as np
+import pytest
+
+from ppo_dap.errors import InputError
+from ppo_dap.logs import Logs, load_logs
+from ppo_dap.logs.coverage import SEGMENT, STRATA, cover, coverage_statistics
+
+
+def ladder(episodes=50, length=20, seed=0):
+    """Episode i has return i and actions of spread 0.1 + i / 100."""
+    rng = np.random.default_rng(seed)
+    rewards = np.repeat(np.arange(episodes) / length, length)
+    actions = rng.normal(size=(episodes * length, 2)) * np.repeat(0.1 + np.arange(episodes) / 100, length)[:, None]
+    ends = np.tile(np.arange(length) == length - 1, episodes)
+    observations = np.repeat(np.arange(episodes), length)[:, None] + np.zeros((1, 3))
+    return Logs(observations=observations, actions=actions, episode_ends=ends, rewards=rewards)
+
+
+def episodes_of(logs):
+    return set(np.unique(logs.observations[:, 0]).astype(int).tolist())
+
+
+def test_wide_is_all_of_it():
+    logs = ladder()
+    assert cover(logs, "wide") is logs
+
+
+def test_medium_keeps_the_share_of_every_stratum():
+    kept = episodes_of(cover(ladder(), "medium", seed=3, fraction=0.3))
+    counts = [sum(10 * i <= episode < 10 * (i + 1) for episode in kept) for i in range(STRATA)]
+    assert counts == [3] * STRATA
+
+
+def test_medium_is_seeded():
+    logs = ladder()
+    same, again, other = (cover(logs, "medium", seed=seed).hash() for seed in (1, 1, 2))
+    assert same == again != other
+
+
+def test_narrow_leaves_out_the_best_the_worst_and_the_straying():
+    logs = ladder()
+    narrow = cover(logs, "narrow", fraction=0.3)
+    # Returns 0 to 49: the 10th percentile is 4.9 and the 60th 29.4.
+    assert episodes_of(narrow) <= set(range(5, 30))
+    assert narrow.num_rows == 0.3 * logs.num_rows
+    middling = logs.select(range(5, 30))
+    scale = logs.actions.std(0)
+    halves = np.square((middling.actions - logs.actions.mean(0)) / scale).mean(1).reshape(-1, SEGMENT).mean(1)
+    kept = np.sort(halves)[: narrow.num_rows // SEGMENT]
+    measured = np.square((narrow.actions - logs.actions.mean(0)) / scale).mean()
+    assert measured == pytest.approx(kept.mean(), rel=1e-5)
+
+
+def test_a_cut_of_narrow_ends_an_episode():
+    logs = ladder()
+    numbered = Logs(
+        observations=np.arange(logs.num_rows)[:, None],
+        actions=logs.actions,
+        episode_ends=logs.episode_ends,
+        rewards=logs.rewards,
+    )
+    narrow = cover(numbered, "narrow")
+    for rows in narrow.episode_slices():
+        row = narrow.observations[rows, 0]
+        np.testing.assert_array_equal(np.diff(row), 1)
+        assert row[0] // 20 == row[-1] // 20
+    assert min(narrow.episode_lengths()) == SEGMENT < 20
+
+
+def test_levels_of_one_size_differ_in_what_they_hold():
+    logs = load_logs("hopper-medium")
+    wide, medium, narrow = (coverage_statistics(cover(logs, level)) for level in ("wide", "medium", "narrow"))
+    assert abs(medium["rows"] - narrow["rows"]) < 0.05 * wide["rows"]
+    assert narrow["action_std"] < 0.96 * medium["action_std"]
+    assert narrow["action_log_volume"] < medium["action_log_volume"] - 0.1
+    assert medium["action_std"] == pytest.approx(wide["action_std"], rel=0.02)
+    assert medium["reward_mean"] == pytest.approx(wide["reward_mean"], rel=0.02)
+
+
+def test_volume_is_the_gaussians_entropy_up_to_a_constant():
+    rng = np.random.default_rng(0)
+    mixing = np.array([[1.0, 0.0], [2.0, 0.5]])
+    actions = rng.normal(size=(200_000, 2)) @ mixing.T
+    ends = np.zeros(len(actions), bool)
+    ends[-1] = True
+    logs = Logs(observations=np.zeros((len(actions), 1)), actions=actions, episode_ends=ends)
+    assert coverage_statistics(logs)["action_log_volume"] == pytest.approx(np.log(0.5), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "message"),
+    [
+        (lambda logs: logs, "broad", "coverage 'broad'"),
+        (lambda logs: Logs(logs.observations, logs.actions, logs.episode_ends), "medium", "no rewards"),
+        (lambda logs: logs.select(range(9)), "narrow", "needs 10 episodes"),
+    ],
+)
+def test_what_cannot_be_covered_is_refused(change, level, message):
+    with pytest.raises(InputError, match=message):
+        cover(change(ladder()), level)
+
+
+def test_too_little_of_middling_return_is_refused():
+    logs = ladder(length=4).select([*range(50)])
+    long = Logs(
+        observations=np.concatenate([logs.observations, np.full((2000, 3), 50.0)]),
+        actions=np.concatenate([logs.actions, np.zeros((2000, 2))]),
+        episode_ends=np.concatenate([logs.episode_ends, np.arange(2000) == 1999]),
+        rewards=np.concatenate([logs.rewards, np.full(2000, 1.0)]),
+    )
+    with pytest.raises(InputError, match="middling return hold 104 rows of 2200"):
+        cover(long, "narrow")
