@@ -60,10 +60,7 @@ def write_lerobot(folder, version="v2.1", lengths=LENGTHS, scalars=False, **info
         name, cuts = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", [stops[1], stops[-1]]
     start = 0
     for number, stop in enumerate(cuts):
-        keys = dict.fromkeys(("episode_chunk", "chunk_index"), 0) | dict.fromkeys(
-            ("episode_index", "file_index"), number
-        )
-        path = folder / name.format(**keys)
+        path = folder / name.format(episode_chunk=0, chunk_index=0, episode_index=number, file_index=number)
         path.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table.slice(start, stop - start), path)
         start = stop

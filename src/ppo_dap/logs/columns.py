@@ -23,6 +23,7 @@ OPTIONAL = {
     "done": ("done", "dones", "next.done"),
 }
 """The other roles, and the names that mean them; the first that is there counts."""
+UNUSED = ("index", "task_index")  # LeRobot's own bookkeeping
 ROLES = (*STEMS, *OPTIONAL)
 LISTED = 12  # names of columns in a message
 RULE = "must have columns such as obs_0, obs_1, ... and act_0, ..., or be told them by columns"
@@ -59,7 +60,7 @@ def choose_columns(names: Sequence[str], columns: Columns | None) -> tuple[dict[
             if name in roles:
                 raise InputError(f"column {name!r} is of {roles[name]} and of {role}: must be of one")
             roles[name] = role
-    used = {*roles, *(name for known in OPTIONAL.values() for name in known)}
+    used = {*roles, *UNUSED, *(name for known in OPTIONAL.values() for name in known)}
     return chosen, [name for name in names if name not in used and not name.startswith("next")]
 
 

@@ -27,12 +27,13 @@ def arrow(path: Path) -> Iterator[Any]:
     require_file(path)
     try:
         import pyarrow
+        from pyarrow import ArrowException
     except ImportError:
         raise InputError(f"{path}: needs pyarrow: run `pip install ppo-dap[tables]`") from None
     with reading(path):
         try:
             yield pyarrow
-        except pyarrow.lib.ArrowException as error:
+        except ArrowException as error:
             if isinstance(error, MemoryError):
                 raise
             raise ValueError(str(error)) from None
