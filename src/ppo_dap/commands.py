@@ -29,7 +29,7 @@ def check_logs(options: argparse.Namespace) -> int:
     """The verdict on logs; exit code 0, 1 (warnings) or 2 (unusable)."""
     from ppo_dap import logs as logs_package
 
-    logs = logs_package.load_logs(options.logs, options.task)
+    logs = logs_package.load_logs(options.logs, options.task, **_reading(options))
     against: dict[str, Any] = {}
     if logs.task is not None:
         from ppo_dap.tasks import describe
@@ -45,6 +45,12 @@ def check_logs(options: argparse.Namespace) -> int:
     return report.exit_code
 
 
+def _reading(options: argparse.Namespace) -> dict[str, Any]:
+    """How the logs are to be read, beside their place."""
+    given = {"columns": options.columns and dict(options.columns), "max_bytes": options.max_bytes}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def pretrain(options: argparse.Namespace) -> int:
     """Stage I."""
     prepare_jax()
@@ -53,7 +59,7 @@ def pretrain(options: argparse.Namespace) -> int:
     from ppo_dap.logs import load_logs
     from ppo_dap.priors import fit_prior
 
-    logs = load_logs(options.logs, options.task)
+    logs = load_logs(options.logs, options.task, seed=options.seed, **_reading(options))
     bounds: dict[str, Any] = {}
     if logs.task is not None:
         from ppo_dap.logs import require_compatible
@@ -63,6 +69,7 @@ def pretrain(options: argparse.Namespace) -> int:
         sizes = {"observation_size": spec.observation_size, "action_size": spec.action_size}
         require_compatible(logs, task=logs.task, **sizes)
         bounds = {"action_low": spec.action_low, "action_high": spec.action_high}
+    bounds |= {name: getattr(options, name) for name in ("action_low", "action_high") if getattr(options, name)}
 
     def show(p: Any) -> None:
         print(
@@ -86,13 +93,15 @@ def train_run(options: argparse.Namespace) -> int:
     prepare_jax()
     given = {name: value for name, value in vars(options).items() if name in configs.field_groups()}
     configs.make(options.preset, **given)  # a bad option is told before JAX is imported
+    from ppo_dap.logs import load_logs
     from ppo_dap.training.run import train
 
+    logs = None if options.logs is None else load_logs(options.logs, **_reading(options))
     run = train(
         options.task,
         options.method,
         prior=options.prior,
-        logs=options.logs,
+        logs=logs,
         out=options.out,
         preset=options.preset,
         resume=options.resume,

@@ -4,6 +4,7 @@ from ppo_dap.logs.check import Finding, Report, check_logs, require_compatible
 from ppo_dap.logs.dataset import Logs, LogsWarning
 from ppo_dap.logs.formats import load_logs, sample_names
 from ppo_dap.logs.npz import save_npz
+from ppo_dap.logs.writing import save_minari
 
 __all__ = [
     "Finding",
@@ -14,5 +15,6 @@ __all__ = [
     "load_logs",
     "require_compatible",
     "sample_names",
+    "save_minari",
     "save_npz",
 ]
