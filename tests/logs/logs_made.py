@@ -52,15 +52,15 @@ def write_d4rl(path, **changes):
     return path
 
 
-def write_minari(root, monkeypatch, dataset_id="hand/made-v0", data_format="hdf5"):
+def write_minari(root, monkeypatch, dataset_id="hand/made-v0", data_format="hdf5", lengths=LENGTHS):
     """The same episodes, written by the official library; returns the dataset's folder."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(root))
     import gymnasium as gym
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    arrays, buffers, start = make_arrays(), [], 0
-    for number, length in enumerate(LENGTHS):
+    arrays, buffers, start = make_arrays(lengths), [], 0
+    for number, length in enumerate(lengths):
         rows = slice(start, start + length)
         last = np.full((1, 3), 99.0, np.float32)  # the final observation, which no action follows
         buffers.append(

@@ -178,9 +178,7 @@ def init_state(rows: Rows, config: DiffusionConfig, rng: np.random.Generator) ->
     return FitState(denoiser, denoiser, _optimizer(config).init(denoiser), jnp.zeros((), jnp.int32))
 
 
-def _moments(
-    values: Float[np.ndarray, "rows columns"],
-) -> tuple[Float[np.ndarray, columns], Float[np.ndarray, columns]]:
+def _moments(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2 columns"]:
     """Mean and standard deviation in float64, a piece at a time: a copy of all would be twice the logs."""
     pieces = np.split(values, range(MOMENT_ROWS, len(values), MOMENT_ROWS))
     mean, square = np.zeros((2, values.shape[1]))
@@ -188,7 +186,7 @@ def _moments(
         mean += np.sum(piece, axis=0, dtype=np.float64) / len(values)
     for piece in pieces:
         square += np.sum(np.square(piece - mean), axis=0) / len(values)
-    return mean, np.sqrt(square)
+    return np.stack([mean, np.sqrt(square)])
 
 
 def _optimizer(config: DiffusionConfig) -> Any:  # optax's own type knows no pytrees but arrays and dicts
