@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -128,23 +129,26 @@ def test_the_prior_says_what_was_drawn(tmp_path):
 
 
 MEASURED = """
-import resource, sys, warnings
+import sys, warnings
 from ppo_dap.logs import load_logs
 import h5py, pyarrow.csv, pyarrow.parquet
 warnings.simplefilter("ignore")
 load_logs("hopper-medium")
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-logs = load_logs(sys.argv[1], max_bytes=2**24)
-after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-print(logs.num_rows, logs.drawn["of_rows"], (after - before) // 1024)
+def peak():  # in KiB; getrusage's would be that of the process that started this one, if it was larger
+    return int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0])
+
+before = peak()
+logs = load_logs(sys.argv[1], max_bytes=int(sys.argv[2]))
+print(logs.num_rows, (logs.drawn or {}).get("of_rows"), (peak() - before) // 1024)
 """
-MOST_MIB = 110  # 16 for the rows, as much again while they are joined, and the libraries' buffers
+MOST_MIB = 120  # 4 for the rows, as much again while they are joined, and the libraries' own buffers
 
 
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux says what the most memory was")
 @pytest.mark.parametrize("layout", ["hdf5", "gzip.hdf5", "npz", "parquet", "csv"])
 def test_memory_is_bounded_by_the_budget_and_not_by_the_file(tmp_path, layout):
-    """200 MB of rows (a fifth of it as text) against a budget of 16 MiB."""
-    count = {"csv": 500_000, "gzip.hdf5": 1_000_000}.get(layout, 2_400_000)
+    """120 MB of rows (40 where they are slow to make) against a budget of 4 MiB."""
+    count = {"csv": 500_000, "gzip.hdf5": 500_000}.get(layout, 1_500_000)
     block = np.random.default_rng(0).standard_normal((count // 100, 20), dtype=np.float32)
     rows = np.tile(np.round(block, 3) if layout == "csv" else block, (100, 1))
     ends = np.arange(count) % 500 == 499
@@ -164,9 +168,16 @@ def test_memory_is_bounded_by_the_budget_and_not_by_the_file(tmp_path, layout):
         columns = {f"{'obs' if i < 15 else 'act'}_{i}": column for i, column in enumerate(rows.T)}
         table = pa.table({**columns, "episode": np.arange(count) // 500})
         csv.write_csv(table, path) if layout == "csv" else parquet.write_table(table, path, row_group_size=count)
-    done = subprocess.run([sys.executable, "-c", MEASURED, path], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    kept, of_rows, mebibytes = map(int, done.stdout.split())
+    kept, of_rows, mebibytes = _measured(path, 2**22)
     assert of_rows == count
-    assert 0.8 * 2**24 < kept * 81 <= 2**24
+    assert 0.8 * 2**22 < kept * 81 <= 2**22
     assert mebibytes < MOST_MIB, f"{mebibytes} MiB"
+    if layout == "hdf5":  # what is measured is no constant
+        assert _measured(path, 2**30)[2] > 2 * MOST_MIB
+
+
+def _measured(path, max_bytes):
+    command = [sys.executable, "-c", MEASURED, str(path), str(max_bytes)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return [int(word) if word != "None" else None for word in done.stdout.split()]

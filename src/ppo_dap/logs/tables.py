@@ -15,6 +15,8 @@ from ppo_dap.logs.reading import PIECE_BYTES, assemble, reading, refuse_large, r
 from ppo_dap.logs.sampling import Budget, Rows
 
 MOST_ROWS = 2**16  # in a piece
+CSV_BLOCK = 2**19
+"""Bytes of text at a time, and so the longest row; pyarrow reads 32 of these ahead."""
 TRUE = ["1", "1.0", "true", "True", "TRUE", "1.000000000000000000e+00"]
 FALSE = ["0", "0.0", "false", "False", "FALSE", "0.000000000000000000e+00"]
 """Flags in a CSV; the last is what numpy.savetxt makes of them."""
@@ -56,7 +58,7 @@ def csv_pieces(path: Path, columns: Columns | None) -> Iterator[Rows]:
     with arrow(path) as pa:
         from pyarrow import csv
 
-        block = csv.ReadOptions(block_size=PIECE_BYTES, use_threads=False)
+        block = csv.ReadOptions(block_size=CSV_BLOCK, use_threads=False)
         with csv.open_csv(path, read_options=block) as file:
             stored = {_plain(name): name for name in reversed(file.schema.names)}
             names = [_plain(name) for name in file.schema.names]
