@@ -26,6 +26,7 @@ EXPANSION = 1200
 bytes must not keep the reader busy for ever. Deflate, the tightest packing that is read, reaches 1032."""
 SMALL_BYTES = 2**26
 JSON_BYTES = 2**26
+MESSAGE = 1000  # characters at most of what a file makes us say
 AXES = {"observations": ("rows", "obs"), "actions": ("rows", "act")}
 """Axes of what has not just rows."""
 
@@ -43,7 +44,8 @@ def reading(path: str | os.PathLike) -> Iterator[None]:
         yield
     except InputError as error:
         text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        text = text if text.startswith(str(path)) else f"{path}: {text}"
+        raise InputError(text[: len(str(path)) + MESSAGE]) from None
     except FileNotFoundError:
         raise InputError(f"{path}: no such file: must be an existing file") from None
     except json.JSONDecodeError as error:
@@ -51,7 +53,7 @@ def reading(path: str | os.PathLike) -> Iterator[None]:
     except MemoryError:
         raise InputError(f"{path}: needs more memory than there is: must declare no more than it holds") from None
     except DAMAGE as error:
-        what = " ".join(str(error).split()) or type(error).__name__
+        what = " ".join(str(error).split())[:MESSAGE] or type(error).__name__
         raise InputError(f"{path}: damaged or not of this format ({what}): must be a complete, readable file") from None
 
 
