@@ -4,6 +4,7 @@ A kind whose name ends in `_loose` may load as other values: its maker wrote oth
 that nobody could tell. All others must be refused, be warned about, or load exactly.
 """
 
+import functools
 import io
 import json
 import os
@@ -118,9 +119,16 @@ def npz_is_a_pickle(folder, rng):
 @maker
 def npz_bomb(folder, rng):
     """Zeros that unpack to a thousand times the file, of the declared shape or of another one."""
-    rows = 10_000_000
-    first = npy((rows, 3) if rng.random() < 0.5 else (rows, 30), bytes(rows * 12))
-    return archive(folder / "a.npz", [("observations.npy", first), ("actions.npy", npy((rows, 1), bytes(rows * 4)))])
+    (folder / "a.npz").write_bytes(zeros(3 if rng.random() < 0.5 else 30))
+    return folder / "a.npz"
+
+
+@functools.cache
+def zeros(columns, rows=8_000_000):
+    first = ("observations.npy", npy((rows, columns), bytes(rows * 12)))
+    content = io.BytesIO()
+    archive(content, [first, ("actions.npy", npy((rows, 1), bytes(rows * 4)))])
+    return content.getvalue()
 
 
 @maker
@@ -514,5 +522,5 @@ def another_format(folder, rng):
     made.append(write_parquet(folder / "1.parquet"))
     content = pick(rng, made).read_bytes()
     path = folder / ("a" + pick(rng, [".npz", ".hdf5", ".csv", ".parquet"]))
-    path.write_bytes(io.BytesIO(content).getvalue())
+    path.write_bytes(content)
     return path

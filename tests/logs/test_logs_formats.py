@@ -169,7 +169,7 @@ def test_sources_that_match_nothing(tmp_path, monkeypatch):
 
 
 def test_import_costs_no_heavy_library():
-    heavy = "'h5py', 'minari', 'gymnasium', 'jax', 'pandas'"
+    heavy = "'h5py', 'minari', 'gymnasium', 'jax', 'pandas', 'pyarrow'"
     code = f"import sys, ppo_dap.logs; print([name for name in ({heavy}) if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -72,10 +72,10 @@ def test_whole_episodes_are_kept_the_same_from_every_layout(tmp_path, monkeypatc
 
 
 def test_each_episode_is_as_likely_as_any_other(small_parts):
-    """Over 500 seeds; a share has a standard deviation of at most 0.0224, and 4.5 of them are allowed."""
+    """Over 200 seeds; a share has a standard deviation of at most 0.0354, and 4.5 of them are allowed."""
     lengths = np.tile([3, 3, 3, 3], 10)
     counts, total = np.zeros(40), 0
-    for seed in range(500):
+    for seed in range(200):
         sample = EpisodeSample(Budget(400, seed))
         ends = np.zeros(120, bool)
         ends[np.cumsum(lengths) - 1] = True
@@ -87,7 +87,7 @@ def test_each_episode_is_as_likely_as_any_other(small_parts):
         assert len(rows["x"]) == 3 * len(kept) == drawn["rows"]
         counts[kept] += 1
         total += len(kept)
-    assert np.abs(counts / 500 - total / 500 / 40).max() < 4.5 * 0.0224
+    assert np.abs(counts / 200 - total / 200 / 40).max() < 4.5 * 0.0354
 
 
 def test_an_episode_longer_than_the_budget_is_drawn_in_stretches(tmp_path, small_parts):
@@ -147,8 +147,8 @@ MOST_MIB = 120  # 4 for the rows, as much again while they are joined, and the l
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux says what the most memory was")
 @pytest.mark.parametrize("layout", ["hdf5", "gzip.hdf5", "npz", "parquet", "csv"])
 def test_memory_is_bounded_by_the_budget_and_not_by_the_file(tmp_path, layout):
-    """120 MB of rows (40 where they are slow to make) against a budget of 4 MiB."""
-    count = {"csv": 500_000, "gzip.hdf5": 500_000}.get(layout, 1_500_000)
+    """100 MB of rows (20 or 30 where they are slow to make) against a budget of 4 MiB."""
+    count = {"csv": 250_000, "gzip.hdf5": 400_000}.get(layout, 1_200_000)
     block = np.random.default_rng(0).standard_normal((count // 100, 20), dtype=np.float32)
     rows = np.tile(np.round(block, 3) if layout == "csv" else block, (100, 1))
     ends = np.arange(count) % 500 == 499
@@ -173,7 +173,7 @@ def test_memory_is_bounded_by_the_budget_and_not_by_the_file(tmp_path, layout):
     assert 0.8 * 2**22 < kept * 81 <= 2**22
     assert mebibytes < MOST_MIB, f"{mebibytes} MiB"
     if layout == "hdf5":  # what is measured is no constant
-        assert _measured(path, 2**30)[2] > 2 * MOST_MIB
+        assert _measured(path, 2**30)[2] > 1.5 * MOST_MIB
 
 
 def _measured(path, max_bytes):
