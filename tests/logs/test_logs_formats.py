@@ -162,6 +162,8 @@ def test_sources_that_match_nothing(tmp_path, monkeypatch):
     assert not (tmp_path / "root").exists()
     fails("", "logs source is empty: must be")
     fails("../x-v0", "unknown logs")
+    fails("x" * 5000, "unknown logs")
+    fails("hopper-medium", "seed is -1: must be a whole number of 0 or more", seed=-1)
     fails(tmp_path / "a.npz", "a.npz: no such file")
     fails(str(tmp_path / "a.h5"), "a.h5: no such file")
     (tmp_path / "a.txt").touch()

@@ -60,7 +60,7 @@ def _read(source: str | os.PathLike, columns: Columns | None, budget: Budget) ->
     if not name:
         raise InputError(f"logs source is empty: {_choices()}")
     path = Path(name).expanduser()
-    if path.exists():
+    if os.path.exists(path):  # False where Path.exists would raise, as for a name that is too long
         if columns and path.suffix not in TABLES and not is_lerobot_folder(path):
             raise InputError(f"{path}: columns is given: must be left out but for tables and LeRobot datasets")
         return _read_path(path, columns, budget)

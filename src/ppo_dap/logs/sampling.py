@@ -46,6 +46,8 @@ class EpisodeSample:
     def __init__(self, budget: Budget):
         if not (isinstance(budget.max_bytes, int) and budget.max_bytes > 0):
             raise InputError(f"max_bytes is {budget.max_bytes!r}: must be a whole number of bytes above 0")
+        if not (isinstance(budget.seed, int) and budget.seed >= 0):
+            raise InputError(f"seed is {budget.seed!r}: must be a whole number of 0 or more")
         self.budget = budget
         self.of_rows = self.of_episodes = 0
         self._rng = np.random.default_rng(budget.seed)

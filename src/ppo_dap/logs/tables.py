@@ -76,7 +76,6 @@ def csv_pieces(path: Path, columns: Columns | None) -> Iterator[Rows]:
         first_row = 0
         with csv.open_csv(path, read_options=block, convert_options=convert) as file:
             for batch in file:
-                # A column of strings or numbers is checked against its name as in the file.
                 batch = batch.rename_columns([_plain(name) for name in batch.schema.names])
                 yield from _piece(batch, chosen, first_row)
                 first_row += batch.num_rows
