@@ -37,7 +37,21 @@ MAX_FILE_LINES = 350
 MAX_FUNCTION_LINES = 60
 MACHINE_PATH = re.compile(r"(?<![\w./-])/(?:root|work|tmp)/[A-Za-z]")
 TEXT_SUFFIXES = {".py", ".md", ".toml", ".txt", ".cff", ".json", ".yml", ".yaml", ".sh"}
-HEAVY = {"jax", "jaxlib", "equinox", "optax", "envpool", "gymnasium", "mujoco", "matplotlib", "minari", "h5py", "scipy"}
+HEAVY = {
+    "jax",
+    "jaxlib",
+    "equinox",
+    "optax",
+    "envpool",
+    "gymnasium",
+    "mujoco",
+    "matplotlib",
+    "minari",
+    "h5py",
+    "pyarrow",
+    "imageio",
+    "scipy",
+}
 
 
 def _imported_modules(node: ast.AST, module: tuple[str, ...]) -> list[tuple[str, ...]]:

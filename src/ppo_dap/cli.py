@@ -104,6 +104,9 @@ def _from_logs_to_runs(command: Command) -> None:
     sub = command("pretrain", commands.pretrain, "Stage I: fit the diffusion prior to logs")
     _logs_option(sub, True)
     sub.add_argument("--task", metavar="ID", help="task of the logs, where they do not say (gives the action bounds)")
+    for bound in ("low", "high"):
+        text = f"{bound}est action, a number or one for each action (default: the task's, or as the logs say)"
+        sub.add_argument(f"--action-{bound}", nargs="+", type=float, metavar="X", help=text)
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
     sub.add_argument("--coverage", default="wide", help="wide, medium or narrow: how much of the logs (default: wide)")
     sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit, and of the coverage (default: 0)")
@@ -157,6 +160,12 @@ def _about_runs(command: Command) -> None:
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
 
+    _collect_options(command)
+    sub = command("methods", commands.methods, "the methods and what each of them uses (Table 3)")
+    sub.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _collect_options(command: Command) -> None:
     sub = command("collect", commands.collect, "log episodes of a run's policy, or make tiers of logs for a task")
     sub.add_argument("folder", nargs="?", metavar="RUN", help="run folder, to log its policy")
     sub.add_argument("--task", action="append", metavar="ID", help="or train behaviour policies for it; again for more")
@@ -185,9 +194,6 @@ def _about_runs(command: Command) -> None:
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
 
-    sub = command("methods", commands.methods, "the methods and what each of them uses (Table 3)")
-    sub.add_argument("--json", action="store_true", help="print JSON")
-
 
 def _number(kind: type, right: Callable[[Any], bool], what: str) -> Callable[[str], Any]:
     """An option's type: a number for which `right` holds."""
@@ -210,9 +216,30 @@ _positive_number = _number(float, lambda v: 0 < v < math.inf, "a number above 0"
 _number_of_0_or_more = _number(float, lambda v: 0 <= v < math.inf, "a number of 0 or more")
 
 
+def _column(text: str) -> tuple[str, list[str] | None]:
+    """A role and the columns that have it; none for `ROLE=`."""
+    role, equals, names = text.partition("=")
+    if not (role and equals):
+        raise argparse.ArgumentTypeError(f"must be ROLE=NAME or ROLE=NAME,NAME,..., not {text!r}")
+    return role, names.split(",") if names else None
+
+
 def _logs_option(parser: Parser, required: bool) -> None:
+    what = "shipped sample, .npz, D4RL .hdf5, .csv or .parquet table, LeRobot or Minari folder, or Minari id"
+    parser.add_argument("--logs", required=required, metavar="LOGS", help=what)
     parser.add_argument(
-        "--logs", required=required, metavar="LOGS", help="shipped sample, .npz, D4RL .hdf5, or Minari folder or id"
+        "--columns",
+        nargs="+",
+        type=_column,
+        metavar="ROLE=NAME,...",
+        help="what a table's columns are, where their names do not say: observations, actions (names or prefixes), "
+        "episode, step, rewards, terminated, truncated, done",
+    )
+    parser.add_argument(
+        "--max-bytes",
+        type=_positive_count,
+        metavar="N",
+        help="of larger logs, episodes drawn by the seed are kept up to this (default: 256 MiB)",
     )
 
 

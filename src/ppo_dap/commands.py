@@ -33,7 +33,7 @@ def check_logs(options: argparse.Namespace) -> int:
 
     if options.html is not None:
         require_html(options.html)
-    logs = logs_package.load_logs(options.logs)
+    logs = logs_package.load_logs(options.logs, **_reading(options))
     task = options.task or logs.task
     bounds: dict[str, Any] = {}
     against: dict[str, Any] = {"task": options.task}
@@ -55,6 +55,12 @@ def check_logs(options: argparse.Namespace) -> int:
     return report.exit_code
 
 
+def _reading(options: argparse.Namespace) -> dict[str, Any]:
+    """How the logs are to be read, beside their place."""
+    given = {"columns": options.columns and dict(options.columns), "max_bytes": options.max_bytes}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def pretrain(options: argparse.Namespace) -> int:
     """Stage I."""
     prepare_jax()
@@ -64,7 +70,8 @@ def pretrain(options: argparse.Namespace) -> int:
     from ppo_dap.logs.coverage import cover, coverage_statistics
     from ppo_dap.priors import fit_prior
 
-    logs = cover(load_logs(options.logs, options.task), options.coverage, options.seed)
+    logs = load_logs(options.logs, options.task, seed=options.seed, **_reading(options))
+    logs = cover(logs, options.coverage, options.seed)
     bounds: dict[str, Any] = {}
     if logs.task is not None:
         from ppo_dap.logs import require_compatible
@@ -74,6 +81,7 @@ def pretrain(options: argparse.Namespace) -> int:
         sizes = {"observation_size": spec.observation_size, "action_size": spec.action_size}
         require_compatible(logs, task=logs.task, **sizes)
         bounds = {"action_low": spec.action_low, "action_high": spec.action_high}
+    bounds |= {name: getattr(options, name) for name in ("action_low", "action_high") if getattr(options, name)}
 
     if options.coverage != "wide" and not options.quiet:
         kept = ", ".join(f"{name} {value:,.4g}" for name, value in coverage_statistics(logs).items())
@@ -101,13 +109,15 @@ def train_run(options: argparse.Namespace) -> int:
     prepare_jax()
     given = {name: value for name, value in vars(options).items() if name in configs.field_groups()}
     configs.make(options.preset, **given)  # a bad option is told before JAX is imported
+    from ppo_dap.logs import load_logs
     from ppo_dap.training.run import train
 
+    logs = None if options.logs is None else load_logs(options.logs, **_reading(options))
     run = train(
         options.task,
         options.method,
         prior=options.prior,
-        logs=options.logs,
+        logs=logs,
         out=options.out,
         preset=options.preset,
         resume=options.resume,

@@ -51,6 +51,7 @@ def write_logs(folder):
     whole = (folder / "good.hdf5").read_bytes()
     (folder / "cut.hdf5").write_bytes(whole[: len(whole) // 2])
     (folder / "logs.csv").write_text("1,2\n")
+    (folder / "logs.txt").write_text("1,2\n")
 
 
 def write_priors(folder):

@@ -31,7 +31,7 @@ def is_refused(capsys, files, here, command, *words):
 
 LOGS = {
     "nan": ("@nan.npz", "nan.npz", "observations is nan", "row 5, column 1", "must be finite"),
-    "empty file": ("@empty.npz", "empty.npz", "is empty", "must be an .npz with observations and actions"),
+    "empty file": ("@empty.npz", "empty.npz", "is empty", "must hold observations and actions"),
     "no arrays": ("@none.npz", "none.npz", "has no observations and no actions", "must have"),
     "no rows": ("@rowless.npz", "rowless.npz", "observations has shape (0, 3)", "must have at least one row"),
     "cut npz": ("@cut.npz", "cut.npz", "damaged", "must be a complete, readable file"),
@@ -39,9 +39,10 @@ LOGS = {
     "pickled": ("@pickled.npz", "pickled.npz", "actions holds pickled", "must be a numeric array"),
     "unknown key": ("@keys.npz", "unknown key 'observation'", "did you mean 'observations'"),
     "missing": ("@nothing.npz", "nothing.npz", "no such file"),
-    "suffix": ("@logs.csv", "unknown file type '.csv'", ".npz, .hdf5 or .h5"),
+    "suffix": ("@logs.txt", "unknown file type '.txt'", ".npz, .hdf5, .h5, .csv, .parquet"),
+    "table": ("@logs.csv", "logs.csv: has no observations", "must have columns such as obs_0"),
     "name": ("hopper-mediun", "unknown logs 'hopper-mediun'", "hopper-medium"),
-    "folder": ("@other", "other: a folder without data/", "must be a Minari dataset"),
+    "folder": ("@other", "other: a folder without data/", "must be a Minari or LeRobot dataset"),
 }
 
 

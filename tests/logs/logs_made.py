@@ -52,15 +52,15 @@ def write_d4rl(path, **changes):
     return path
 
 
-def write_minari(root, monkeypatch, dataset_id="hand/made-v0"):
+def write_minari(root, monkeypatch, dataset_id="hand/made-v0", data_format="hdf5", lengths=LENGTHS):
     """The same episodes, written by the official library; returns the dataset's folder."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(root))
     import gymnasium as gym
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    arrays, buffers, start = make_arrays(), [], 0
-    for number, length in enumerate(LENGTHS):
+    arrays, buffers, start = make_arrays(lengths), [], 0
+    for number, length in enumerate(lengths):
         rows = slice(start, start + length)
         last = np.full((1, 3), 99.0, np.float32)  # the final observation, which no action follows
         buffers.append(
@@ -81,6 +81,7 @@ def write_minari(root, monkeypatch, dataset_id="hand/made-v0"):
             buffers,
             observation_space=gym.spaces.Box(-np.inf, np.inf, (3,), np.float32),
             action_space=gym.spaces.Box(-1, 2, (2,), np.float32),
+            data_format=data_format,
         )
     return root / dataset_id
 
@@ -91,10 +92,10 @@ def edit_metadata(folder, **changes):
     path.write_text(json.dumps({key: value for key, value in metadata.items() if value is not DROP}))
 
 
-def fails(source, match):
-    """`load_logs(source)` must raise one line that matches; returns the line."""
+def fails(source, match, **options):
+    """`load_logs` must raise one line that matches; returns the line."""
     with pytest.raises(InputError, match=match) as caught:
-        load_logs(source)
+        load_logs(source, **options)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 

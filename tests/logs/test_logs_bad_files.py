@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
-from logs.logs_made import DROP, edit_metadata, fails, write_d4rl, write_minari, write_npz
+from logs.logs_made import edit_metadata, fails, write_d4rl, write_minari, write_npz
 from ppo_dap.errors import InputError
 from ppo_dap.logs import LogsWarning, load_logs, reading
 
@@ -63,25 +63,29 @@ def test_npz_members_are_checked_before_they_are_loaded(tmp_path, monkeypatch):
     def write(name, content, compression=zipfile.ZIP_STORED):
         with zipfile.ZipFile(path, "w", compression) as archive:
             archive.writestr(name, content)
+            archive.writestr("actions.npy", npy((5, 1), bytes(20)))
 
     def npy(shape, data=b"", version=1):
         header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}".ljust(117) + "\n"
         return b"\x93NUMPY" + bytes([version, 0]) + len(header).to_bytes(2, "little") + header.encode() + data
 
     write("observations.npy", npy((2**40, 3)))
-    fails(path, "observations declares 13194139533312 bytes: must be at most")
+    fails(path, "observations declares 13194139533312 bytes .* but holds 0: both must be equal")
     write("observations.npy", npy((5, 3), bytes(59)))
-    fails(path, "observations declares 60 bytes but holds 59")
+    fails(path, "observations declares 60 bytes .* but holds 59")
     write("observations.npy", npy((5, 3), bytes(60), version=9))
     fails(path, r"observations has .npy version \(9, 0\)|damaged")
     write("observations.npy", npy((5, 3), bytes(60)), zipfile.ZIP_BZIP2)
     fails(path, "observations has zip compression 12")
+    write("observations.npy", npy((-5, -3), bytes(60)))
+    fails(path, r"observations declares 60 bytes \(\(-5, -3\)\) but holds 60")
     for name in ("../observations.npy", "observations.txt", "a/observations.npy"):
         write(name, b"")
         fails(path, "is not an array: must be KEY.npy")
     write_npz(path)
-    monkeypatch.setattr(reading, "MAX_BYTES", 100)
-    fails(path, "the archive declares [0-9]+ bytes: must be at most 100")
+    for name, limit in (("SMALL_BYTES", 100), ("EXPANSION", 0.1)):
+        monkeypatch.setattr(reading, name, limit)
+    fails(path, "the archive declares [0-9]+ bytes in a file of [0-9]+: must be at most")
 
 
 @pytest.mark.parametrize("writer", [write_npz, write_d4rl])
@@ -130,11 +134,11 @@ def test_damaged_hdf5(tmp_path):
     path.write_bytes(whole[: len(whole) // 2])
     assert fails(path, "damaged or not of this format").startswith(str(path))
     path.write_bytes(b"")
-    fails(path, "the file is empty: must be HDF5")
+    fails(path, "the file is empty: must hold")
     with h5py.File(path, "w") as file:
         file.create_dataset("observations", shape=(2**40, 3), dtype="f4", chunks=(1024, 3))
         file["actions"] = np.zeros((3, 1))
-    fails(path, "observations declares 13194139533312 bytes")
+    fails(path, "observations declares 13194139533312 bytes in a file of")
 
 
 @pytest.mark.parametrize(
@@ -144,9 +148,11 @@ def test_damaged_hdf5(tmp_path):
         ({"action_space": '{"type": "Discrete", "n": 3}'}, "action_space is Discrete: must be Box"),
         ({"action_space": "{"}, "metadata is not JSON"),
         ({"action_space": '{"type": "Box", "low": [0], "high": [1]}'}, "action_low has 1 entries but actions has 2"),
-        ({"data_format": "arrow", "action_space": DROP}, "lacks observation_space or action_space"),
-        ({"data_format": "arrow"}, "needs pyarrow|no such file|damaged"),
-        ({"data_format": "tape"}, "damaged"),
+        ({"action_space": '{"type": "Box", "shape": [2, 2]}'}, r"action_space has shape \[2, 2\]: must be one flat"),
+        ({"data_format": "arrow"}, "has no episodes: must have at least one"),
+        ({"data_format": "tape"}, "data_format is 'tape': must be hdf5, arrow or parquet"),
+        ({"env_spec": "{"}, "metadata is not JSON"),
+        ({"env_spec": '{"id": 3}'}, "env_spec has id 3: must be a Gymnasium id"),
     ],
 )
 def test_bad_minari_metadata(minari_folder, space, match):
@@ -165,8 +171,12 @@ def _replace(file, name, value):
     [
         ("episode_1/observations", np.zeros((3, 3)), "episode_1 has 3 actions and 3 observations: must have T actions"),
         ("episode_1/observations", None, "episode_1 has no observations"),
-        ("episode_1/rewards", np.zeros(2), "episode_1 has 2 rewards and 3 actions"),
-        ("episode_1/observations", np.zeros((4, 5)), r"observations has columns \[\(3,\), \(5,\)\] in different"),
+        ("episode_1/rewards", np.zeros(2), "episode_1 has 2 rewards and 3 actions: must be equal"),
+        (
+            "episode_1/observations",
+            np.zeros((4, 5)),
+            "observations has 5 columns from row 4 on and 3 before: must have",
+        ),
     ],
 )
 def test_bad_minari_episodes(minari_folder, name, value, match):

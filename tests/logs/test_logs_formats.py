@@ -20,7 +20,7 @@ def minari_folder(tmp_path, monkeypatch):
 def test_the_same_episodes_load_the_same_from_every_format(tmp_path, minari_folder):
     sources = [
         write_npz(tmp_path / "a.npz"),
-        write_npz(tmp_path / "b.npz", truncated=None, episode_id=np.repeat([7, 3, 7], [4, 3, 5])),
+        write_npz(tmp_path / "b.npz", truncated=None, episode_id=np.repeat([7, 3, 5], [4, 3, 5])),
         write_d4rl(tmp_path / "a.hdf5", next_observations=np.zeros((12, 3)), **{"infos/qpos": np.zeros((12, 6))}),
         minari_folder,
         minari_folder / "data",
@@ -162,14 +162,16 @@ def test_sources_that_match_nothing(tmp_path, monkeypatch):
     assert not (tmp_path / "root").exists()
     fails("", "logs source is empty: must be")
     fails("../x-v0", "unknown logs")
+    fails("x" * 5000, "unknown logs")
+    fails("hopper-medium", "seed is -1: must be a whole number of 0 or more", seed=-1)
     fails(tmp_path / "a.npz", "a.npz: no such file")
     fails(str(tmp_path / "a.h5"), "a.h5: no such file")
-    (tmp_path / "a.csv").touch()
-    fails(tmp_path / "a.csv", "unknown file type '.csv': must be .npz, .hdf5 or .h5")
+    (tmp_path / "a.txt").touch()
+    fails(tmp_path / "a.txt", "unknown file type '.txt': must be .npz, .hdf5, .h5, .csv, .parquet")
 
 
 def test_import_costs_no_heavy_library():
-    heavy = "'h5py', 'minari', 'gymnasium', 'jax', 'pandas'"
+    heavy = "'h5py', 'minari', 'gymnasium', 'jax', 'pandas', 'pyarrow'"
     code = f"import sys, ppo_dap.logs; print([name for name in ({heavy}) if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

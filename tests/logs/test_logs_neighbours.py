@@ -97,7 +97,7 @@ def test_one_policy_is_accused_as_rarely_as_the_p_value_says():
 
 def test_few_rows_or_a_single_episode_are_not_checked():
     logs = policies(ONE)
-    for few in (logs.select([0]), logs.select([0, 1])._take(np.arange(50, 70))):
+    for few in (logs.select([0]), logs.select([0, 1]).take(np.arange(50, 70))):
         report = check_logs(few)
         assert len(find_neighbours(few).rows) == 0
         assert message(report, "neighbour spread").startswith("not checked")

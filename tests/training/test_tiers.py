@@ -12,7 +12,10 @@ from ppo_dap.errors import InputError
 from ppo_dap.logs.card import card_text, describe_logs
 from ppo_dap.training import tiers
 
-TASK, ROWS, STEPS, SEED = "Hopper-v5", 600, 6000, 7
+TASK, ROWS, STEPS, SEED = "InvertedPendulum-v5", 600, 6000, 7
+
+
+FOLDER = "invertedpendulum-v5"
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +34,7 @@ def behaviour(store):
 
 
 def card(store, tier):
-    return json.loads((store / "hopper-v5" / f"{tier}-v0" / "card.json").read_text())
+    return json.loads((store / FOLDER / f"{tier}-v0" / "card.json").read_text())
 
 
 def evaluations(run):
@@ -40,7 +43,7 @@ def evaluations(run):
 
 @pytest.mark.parametrize("tier", tiers.TIERS)
 def test_a_tier_is_what_its_card_says(store, tier):
-    folder, about = store / "hopper-v5" / f"{tier}-v0", card(store, tier)
+    folder, about = store / FOLDER / f"{tier}-v0", card(store, tier)
     logs = ppo_dap.load_logs(folder)
     assert logs.hash() == about["sha256"]
     assert logs.task == TASK
@@ -48,7 +51,7 @@ def test_a_tier_is_what_its_card_says(store, tier):
     returns = np.array([logs.rewards[rows].sum(dtype=np.float64) for rows in logs.episode_slices()])
     assert about["returns"]["mean"] == pytest.approx(returns.mean(), abs=1e-2)
     assert sum(about["returns"]["histogram"]["episodes"]) == logs.num_episodes == len(returns)
-    assert about["actions"]["at_bound"][0] == pytest.approx(np.mean(np.abs(logs.actions[:, 0]) == 1), abs=1e-4)
+    assert about["actions"]["at_bound"][0] == pytest.approx(np.mean(np.abs(logs.actions[:, 0]) == 3), abs=1e-4)
     assert f"--tier {tier} " in about["command"]
     assert about["versions"]["envpool"]
     text = (folder / "README.md").read_text()
@@ -77,8 +80,8 @@ def test_expert_is_the_best(store, behaviour):
 
 
 def test_medium_expert_is_half_of_each(store):
-    whole = ppo_dap.load_logs(store / "hopper-v5" / "medium-expert-v0")
-    medium = ppo_dap.load_logs(store / "hopper-v5" / "medium-v0")
+    whole = ppo_dap.load_logs(store / FOLDER / "medium-expert-v0")
+    medium = ppo_dap.load_logs(store / FOLDER / "medium-v0")
     # The first half has the seed of medium's own logs, so it begins as they do.
     first = whole.episode_lengths()[0]
     np.testing.assert_array_equal(whole.observations[:first], medium.observations[:first])
@@ -88,7 +91,7 @@ def test_medium_expert_is_half_of_each(store):
 
 
 def test_medium_replay_is_of_the_training_before_medium(store, behaviour):
-    logs = ppo_dap.load_logs(store / "hopper-v5" / "medium-replay-v0")
+    logs = ppo_dap.load_logs(store / FOLDER / "medium-replay-v0")
     until = card(store, "medium")["policies"][0]["at_step"]
     paths = sorted((behaviour.folder / "history").glob("rollout-*.npz"))
     stepped = np.cumsum([np.load(path)["valid"].sum() for path in paths])
@@ -103,12 +106,12 @@ def test_mixed_is_of_three_runs(store):
 
 
 def test_minari_opens_it_with_the_true_last_observations(store):
-    dataset = minari.MinariDataset(store / "hopper-v5" / "expert-v0" / "data")
+    dataset = minari.MinariDataset(store / FOLDER / "expert-v0" / "data")
     for episode in dataset.iterate_episodes():
         last = episode.observations[-1]
-        # Hopper-v5's own rule for when an episode ends.
-        fallen = last[0] < 0.7 or abs(last[1]) > 0.2 or (np.abs(last[1:]) > 100).any()
-        assert bool(episode.terminations[-1]) == bool(fallen)
+        # The task's own rule for when an episode ends.
+        assert bool(episode.terminations[-1]) == (abs(last[1]) > 0.2)
+        assert (np.abs(episode.observations[:-1, 1]) <= 0.2).all()
     assert dataset.recover_environment().spec.id == TASK
 
 
@@ -128,7 +131,7 @@ def test_other_logs_do_not_go_where_some_are(store):
 
 
 def test_a_dataset_without_its_card_is_made_again(store):
-    folder = store / "hopper-v5" / "random-v0"
+    folder = store / FOLDER / "random-v0"
     before = card(store, "random")
     (folder / "card.json").unlink()
     (folder / "data" / "main_data.hdf5").write_bytes(b"half of it")
@@ -136,11 +139,24 @@ def test_a_dataset_without_its_card_is_made_again(store):
     assert card(store, "random")["sha256"] == before["sha256"] == ppo_dap.load_logs(folder).hash()
 
 
-def test_the_estimate_counts_what_is_missing(store, tmp_path):
-    everything = tiers.estimate(TASK, ["mixed"], ROWS, SEED, 10**6, tmp_path)
-    one = tiers.estimate(TASK, ["medium"], ROWS, SEED, 10**6, tmp_path)
-    assert 2 < everything / one < 4.5  # three runs, and a speed that is measured each time
+def test_the_estimate_counts_what_is_missing(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(tiers, "speed_of", lambda task: 1000.0)
+    monkeypatch.setattr(tiers, "TRAINING_SHARE", 0.5)
+
+    def seconds(*names):
+        return tiers.estimate(TASK, names, 10_000, SEED, 10**6, tmp_path)
+
+    assert seconds("medium") == 10**6 / 500 + 10_000 / 1000
+    assert seconds("medium", "medium-replay") == seconds("medium")  # a replay is not stepped again
+    assert seconds("mixed") == 3 * 10**6 / 500 + 10_000 / 1000
     assert tiers.estimate(TASK, list(tiers.TIERS), ROWS, SEED, STEPS, store) == 0
+
+
+def test_a_run_that_learned_nothing_makes_no_tier(store):
+    behaviour = tiers.behave(TASK, SEED, STEPS, store / "behaviours")
+    behaviour.__dict__["returns"] = dict.fromkeys(behaviour.returns, 1.0)
+    with pytest.raises(InputError, match=f"better than its first: {STEPS} steps are too few"):
+        tiers.tier_episodes("medium", ROWS, SEED, [behaviour])
 
 
 @pytest.mark.parametrize(
@@ -164,7 +180,7 @@ def test_a_card_is_readable(store):
     policies = [{"seed": 0, "train_steps": 10, "at_step": 5, "return": 1.0}]
     made = {"meaning": "a meaning", "policies": policies, "versions": {"jax": "1"}, "command": "c"}
     lines = card_text("x/y-v0", describe_logs(logs) | made).splitlines()
-    bars = [line for line in lines if line.endswith("#")]
+    bars = [line for line in lines if " to " in line and not line.startswith("-")]
     assert len(bars) == 10
     assert max(line.count("#") for line in bars) == 40
     assert max(map(len, lines)) < 160

@@ -6,6 +6,7 @@ from ppo_dap.logs.finding import Finding, Report
 from ppo_dap.logs.formats import load_logs, sample_names
 from ppo_dap.logs.npz import save_npz
 from ppo_dap.logs.report import write_report
+from ppo_dap.logs.writing import save_minari
 
 __all__ = [
     "Finding",
@@ -16,6 +17,7 @@ __all__ = [
     "load_logs",
     "require_compatible",
     "sample_names",
+    "save_minari",
     "save_npz",
     "write_report",
 ]

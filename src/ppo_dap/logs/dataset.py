@@ -1,7 +1,7 @@
 """`Logs`: the logged trajectories D_off as flat arrays with whole episodes."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,58 +12,72 @@ from ppo_dap.errors import InputError
 ARRAY_FIELDS = ("observations", "actions", "episode_ends", "rewards", "terminated", "action_low", "action_high")
 LATER_FIELDS = ("next_observations", "times")
 """Hashed only where they are there, so that the hash of logs without them stays what it was."""
+FLAGS = ("episode_ends", "terminated", "truncated", "done")
 
 
 class LogsWarning(UserWarning):
     """Logs that can be used but that the user should look at."""
 
 
-def as_float32(name: str, value: object, axes: tuple[str, ...], finite: bool = True) -> np.ndarray:
+def require_numbers(name: str, dtype: np.dtype, shape: tuple[int, ...], axes: tuple[str, ...]) -> None:
+    """Raise `InputError` unless an array of this dtype and shape holds numbers along the given axes."""
+    if dtype.kind not in "fiub":
+        right = "bool" if name in FLAGS else "numbers, float or integer"
+        raise InputError(f"{name} has dtype {dtype}: must be {right}")
+    if len(shape) != len(axes):
+        right = f"({', '.join(axes)}{',' if len(axes) == 1 else ''})"
+        hint = f", so ({shape[0]}, 1) if it is a single column" if len(shape) == 1 else ""
+        raise InputError(f"{name} has shape {shape}: must be {right}{hint}")
+
+
+def as_float32(name: str, value: object, axes: tuple[str, ...], finite: bool = True, first_row: int = 0) -> np.ndarray:
     """`as_numbers` in float32, the dtype of all that is learned from."""
-    return as_numbers(name, value, axes, np.float32, finite)
+    return as_numbers(name, value, axes, np.float32, finite, first_row)
 
 
-def as_numbers(name: str, value: object, axes: tuple[str, ...], dtype: type, finite: bool = True) -> np.ndarray:
+def as_numbers(
+    name: str, value: object, axes: tuple[str, ...], dtype: type, finite: bool = True, first_row: int = 0
+) -> np.ndarray:
     """`value` as an array of `dtype` with the given axes; integers and other floats are converted.
 
     Raises `InputError` for another kind of dtype or number of axes, and for the first entry that is not finite in
-    `dtype` (`finite=False` lets infinities pass, as bounds may be infinite, but never NaN).
+    `dtype` (`finite=False` lets infinities pass, as bounds may be infinite, but never NaN). `first_row` is the number
+    that messages give to the first row.
     """
     array = np.asarray(value)
-    if array.dtype.kind not in "fiub":
-        raise InputError(f"{name} has dtype {array.dtype}: must be numbers, float or integer")
-    if array.ndim != len(axes):
-        right = f"({', '.join(axes)}{',' if len(axes) == 1 else ''})"
-        hint = f", so ({array.size}, 1) if it is a single column" if array.ndim == 1 else ""
-        raise InputError(f"{name} has shape {array.shape}: must be {right}{hint}")
+    require_numbers(name, array.dtype, array.shape, axes)
     with np.errstate(over="ignore"):  # an overflow becomes inf and is reported below with its place
         converted = np.ascontiguousarray(array, dtype=dtype)
     bad = ~np.isfinite(converted) if finite else np.isnan(converted)
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
-        place = ", ".join(f"{axis} {i}" for axis, i in zip(("row", "column"), index, strict=False))
+        places = (index[0] + first_row, *index[1:])
+        place = ", ".join(f"{axis} {i}" for axis, i in zip(("row", "column"), places, strict=False))
         found = f"{name} is {array[index]} at {place} ({bad.sum()} such values)"
         raise InputError(f"{found}: must be finite in {np.dtype(dtype)}")
     return converted
 
 
-def as_flags(name: str, value: object) -> np.ndarray:
+def as_flags(name: str, value: object, first_row: int = 0) -> np.ndarray:
     """`value` as bool (rows,). Raises `InputError` unless it is one-dimensional and holds only 0 and 1."""
     array = np.asarray(value)
-    if array.ndim != 1:
-        raise InputError(f"{name} has shape {array.shape}: must be (rows,)")
-    if array.dtype.kind not in "fiub":
-        raise InputError(f"{name} has dtype {array.dtype}: must be bool")
+    require_numbers(name, array.dtype, array.shape, ("rows",))
     bad = np.flatnonzero((array != 0) & (array != 1))
     if bad.size:
-        raise InputError(f"{name} is {array[bad[0]]} at row {bad[0]}: must be 0 or 1")
+        raise InputError(f"{name} is {array[bad[0]]} at row {bad[0] + first_row}: must be 0 or 1")
     return array.astype(bool)
 
 
-def require_rows(name: str, array: np.ndarray, rows: int) -> None:
-    """Raise `InputError` unless `array` has as many rows as the observations."""
-    if len(array) != rows:
-        raise InputError(f"{name} has {len(array)} rows but observations has {rows}: both must have the same number")
+def require_rows(name: str, count: int, rows: int) -> None:
+    """Raise `InputError` unless an array of `count` rows has as many as the observations."""
+    if count != rows:
+        raise InputError(f"{name} has {count} rows but observations has {rows}: both must have the same number")
+
+
+def require_some(name: str, shape: tuple[int, ...]) -> None:
+    """Raise `InputError` for observations or actions without a row or without a column."""
+    if 0 in shape:
+        raise InputError(f"{name} has shape {shape}: must have at least one row and one column")
 
 
 # The fields are annotated np.ndarray and not with jaxtyping: __post_init__ converts and checks them in every run, and
@@ -98,6 +112,9 @@ class Logs:
     """float32 (rows, obs), the true successor of each observation, finite; used by `check_logs` alone."""
     times: np.ndarray | None = None
     """float64 (rows,), time stamps in seconds, finite; used by `check_logs` alone."""
+    drawn: Mapping[str, int] | None = None
+    """None where these are all rows of the source. Else what `load_logs` drew from it, above its `max_bytes`: `rows` of
+    `of_rows`, `episodes` of `of_episodes`, by `seed` within `max_bytes`; no part of the hash."""
 
     def __post_init__(self):
         values = {
@@ -115,10 +132,9 @@ class Logs:
             values["times"] = as_numbers("times", self.times, ("rows",), np.float64)
         rows = len(values["observations"])
         for name in ("observations", "actions"):
-            if 0 in values[name].shape:
-                raise InputError(f"{name} has shape {values[name].shape}: must have at least one row and one column")
+            require_some(name, values[name].shape)
         for name, array in values.items():
-            require_rows(name, array, rows)
+            require_rows(name, len(array), rows)
         following = values.get("next_observations")
         if following is not None and following.shape != values["observations"].shape:
             found = f"{following.shape[1]} columns but observations has {values['observations'].shape[1]}"

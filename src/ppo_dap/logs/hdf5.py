@@ -1,47 +1,75 @@
 """HDF5 files in D4RL layout (flat arrays), and opening and reading HDF5 with errors that name what is wrong."""
 
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ppo_dap.errors import InputError
 from ppo_dap.logs.dataset import LATER_FIELDS, Logs, LogsWarning
-from ppo_dap.logs.reading import assemble, reading, refuse_large
+from ppo_dap.logs.reading import assemble, reading, refuse_large, require_file, row_pieces
+from ppo_dap.logs.sampling import Budget
 
+D4RL_NAMES = {
+    "observations": "observations",
+    "actions": "actions",
+    "rewards": "rewards",
+    "terminals": "terminated",
+    "timeouts": "truncated",
+    **{name: name for name in LATER_FIELDS},
+}
 D4RL_UNUSED = ("next_actions", "infos", "metadata")
+CHUNK_BYTES = 2**26
+"""Chunks of up to this size are unpacked once; larger ones again for each piece of rows."""
+LARGEST_CHUNK = 2**30
 
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
-    """The open h5py file. Raises `InputError` when `path` is missing, empty or damaged."""
+    """The open h5py file. Raises `InputError` when `path` is missing, empty, no file or damaged."""
     import h5py
 
-    if path.is_file() and path.stat().st_size == 0:
-        raise InputError(f"{path}: the file is empty: must be HDF5")
-    with reading(path), h5py.File(path, "r") as file:
-        yield file
+    with reading(path):
+        require_file(path)
+        with h5py.File(path, "r", rdcc_nbytes=CHUNK_BYTES) as file:
+            yield file
 
 
-def read_array(group: Any, name: str) -> np.ndarray:
-    """The array `group[name]`. Raises `InputError` for groups, links to other files and oversized arrays."""
+def find_item(group: Any, name: str) -> Any:
+    """What lies at `group[name]`. Raises `InputError` for links, which could read what the user did not name."""
     import h5py
 
-    where = f"{group.name.strip('/')}/{name}".lstrip("/")
-    # A link to another file would read what the user did not name.
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise InputError(f"{where} is a link: must be an array in this file")
-    item = group[name]
+        raise InputError(f"{_place(group, name)} is a link: must be an array in this file")
+    return group[name]
+
+
+def find_array(group: Any, name: str, file_bytes: int) -> Any:
+    """The h5py dataset `group[name]`, to be read by slices of rows.
+
+    Raises `InputError` for groups, links to other files and arrays larger than a file of `file_bytes` can hold.
+    """
+    import h5py
+
+    where, item = _place(group, name), find_item(group, name)
     if not isinstance(item, h5py.Dataset):
         inside = ", ".join(sorted(item)) if isinstance(item, h5py.Group) else type(item).__name__
         raise InputError(f"{where} is a group ({inside}), so a Dict or Tuple space: must be one flat array")
     if item.external or item.is_virtual:
         raise InputError(f"{where} is stored in another file: must be an array in this file")
-    refuse_large(where, item.size * item.dtype.itemsize)
-    return np.asarray(item[()])
+    if item.shape is None:
+        raise InputError(f"{where} has no shape: must be an array")
+    refuse_large(where, math.prod(item.shape) * item.dtype.itemsize, file_bytes)
+    chunk_bytes = math.prod(item.chunks or ()) * item.dtype.itemsize
+    if chunk_bytes > LARGEST_CHUNK:
+        raise InputError(f"{where} has chunks of {chunk_bytes} bytes: must be at most {LARGEST_CHUNK}")
+    return item
+
+
+def _place(group: Any, name: str) -> str:
+    return f"{group.name.strip('/')}/{name}".lstrip("/")
 
 
 def is_minari(file: Any) -> bool:
@@ -49,7 +77,7 @@ def is_minari(file: Any) -> bool:
     return "observations" not in file and any(name.startswith("episode_") for name in file)
 
 
-def read_d4rl(path: Path) -> Logs:
+def read_d4rl(path: Path, budget: Budget) -> Logs:
     """Read D4RL's flat arrays: `observations`, `actions`, and `rewards`, `terminals`, `timeouts` if there.
 
     `next_observations` and `times` (seconds) are kept too.
@@ -61,13 +89,11 @@ def read_d4rl(path: Path) -> Logs:
         if missing:
             found = ", ".join(sorted(file)) or "nothing"
             raise InputError(f"has no {' and no '.join(missing)} (found {found}): must have observations and actions")
-        wanted = {"rewards": "rewards", "terminals": "terminated", "timeouts": "truncated"}
-        wanted |= {name: name for name in LATER_FIELDS}
-        known = ("observations", "actions", *wanted, *D4RL_UNUSED)
+        known = (*D4RL_NAMES, *D4RL_UNUSED)
         strange = sorted(set(file) - set(known))
         if strange:
             message = f"ignored {', '.join(strange)}, not of the D4RL layout ({', '.join(known)})"
             warnings.warn(f"{path}: {message}", LogsWarning, stacklevel=2)
-        arrays: dict[str, Any] = {field: read_array(file, name) for name, field in wanted.items() if name in file}
-        observations, actions = read_array(file, "observations"), read_array(file, "actions")
-        return assemble(path, observations=observations, actions=actions, **arrays)
+        size = path.stat().st_size
+        arrays = {field: find_array(file, name, size) for name, field in D4RL_NAMES.items() if name in file}
+        return assemble(path, row_pieces(arrays), budget)

@@ -11,11 +11,21 @@ import numpy as np
 
 from ppo_dap.errors import InputError
 from ppo_dap.logs.dataset import Logs
-from ppo_dap.logs.hdf5 import open_hdf5, read_array
-from ppo_dap.logs.reading import assemble, reading
+from ppo_dap.logs.hdf5 import find_array, find_item, open_hdf5
+from ppo_dap.logs.reading import assemble, read_json, reading, row_pieces
+from ppo_dap.logs.sampling import Budget, Rows
+from ppo_dap.logs.tables import read_ipc, read_parquet_whole
 
 MAIN_FILE = "main_data.hdf5"
 METADATA_FILE = "metadata.json"
+EPISODE = re.compile(r"episode_\d{1,18}")
+NAMES = {
+    "observations": "observations",
+    "actions": "actions",
+    "rewards": "rewards",
+    "terminations": "terminated",
+    "truncations": "truncated",
+}
 DATASET_ID = re.compile(r"(?:[\w-]+/)*[\w-]+-v\d+")
 
 
@@ -30,16 +40,16 @@ def is_dataset_folder(folder: Path) -> bool:
     return any((place / name).is_file() for place in (folder, folder / "data") for name in (MAIN_FILE, METADATA_FILE))
 
 
-def read_minari_id(dataset_id: str) -> Logs:
+def read_minari_id(dataset_id: str, budget: Budget) -> Logs:
     """Read the dataset of that id from the local root; if absent, the `InputError` says how to download it."""
     folder = minari_root() / dataset_id
     if not is_dataset_folder(folder):
         raise InputError(f"Minari dataset {dataset_id!r} is not in {minari_root()}: run `minari download {dataset_id}`")
-    return read_minari(folder)
+    return read_minari(folder, budget)
 
 
-def read_minari(folder: Path) -> Logs:
-    """Read a Minari dataset folder, hdf5 or arrow: T+1 observations become T states and their successors.
+def read_minari(folder: Path, budget: Budget) -> Logs:
+    """Read a Minari dataset folder, hdf5, arrow or parquet. Each episode's T+1 observations lose the last one.
 
     Raises `InputError` in one line, naming the episode, for Dict or Tuple spaces, discrete actions and damaged files.
     """
@@ -47,32 +57,29 @@ def read_minari(folder: Path) -> Logs:
         data = folder / "data" if (folder / "data").is_dir() else folder
         metadata = _metadata(data)
         low, high = _action_bounds(metadata)
-        if metadata.get("data_format", "hdf5") == "hdf5":
-            episodes = list(_hdf5_episodes(data / MAIN_FILE))
+        layout = metadata.get("data_format", "hdf5")
+        if layout == "hdf5":
+            pieces = _hdf5_pieces(data / MAIN_FILE)
+        elif layout in ("arrow", "parquet"):
+            pieces = _arrow_pieces(data, layout)
         else:
-            episodes = list(_stored_episodes(data, metadata))
-        if not episodes:
-            raise InputError("has no episodes: must have at least one")
-        columns = {name: _join(name, episodes) for name in episodes[0]}
-        lengths = [len(episode["actions"]) for episode in episodes]
-        episode_id = np.repeat(np.arange(len(episodes)), lengths)
-        task = _task(metadata)
-        return assemble(folder, **columns, episode_id=episode_id, task=task, action_low=low, action_high=high)
+            raise InputError(f"data_format is {layout!r}: must be hdf5, arrow or parquet")
+        return assemble(folder, pieces, budget, task=_task(metadata), action_low=low, action_high=high)
 
 
 def _metadata(data: Path) -> dict[str, Any]:
     if (data / METADATA_FILE).is_file():
-        metadata = json.loads((data / METADATA_FILE).read_text(encoding="utf-8"))
-        if not isinstance(metadata, dict):
-            raise InputError(f"{METADATA_FILE} is a {type(metadata).__name__}: must be a JSON object")
-        return metadata
+        return read_json(data / METADATA_FILE)
     with open_hdf5(data / MAIN_FILE) as file:  # Minari below 0.5 kept the metadata as attributes
         return {key: value for key, value in file.attrs.items() if isinstance(value, str)}
 
 
 def _task(metadata: dict[str, Any]) -> str | None:
     spec = metadata.get("env_spec")
-    return json.loads(spec)["id"] if spec else None
+    task = json.loads(spec)["id"] if spec else None
+    if task is not None and not isinstance(task, str):
+        raise InputError(f"env_spec has id {task!r}: must be a Gymnasium id")
+    return task
 
 
 def _action_bounds(metadata: dict[str, Any]) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -80,55 +87,69 @@ def _action_bounds(metadata: dict[str, Any]) -> tuple[np.ndarray | None, np.ndar
         space = json.loads(metadata[name]) if name in metadata else {"type": "Box"}
         if space["type"] != "Box":
             raise InputError(f"{name} is {space['type']}: must be Box, one flat array of real numbers")
+        if len(space.get("shape", [0])) != 1:
+            raise InputError(f"{name} has shape {space['shape']}: must be one flat array of real numbers")
         if name == "action_space" and "low" in space:
             return np.asarray(space["low"], np.float32), np.asarray(space["high"], np.float32)
     return None, None
 
 
-def _hdf5_episodes(path: Path) -> Iterator[dict[str, np.ndarray]]:
+def _hdf5_pieces(path: Path) -> Iterator[Rows]:
     with open_hdf5(path) as file:
-        names = [name for name in file if re.fullmatch(r"episode_\d+", name)]
-        for name in sorted(names, key=lambda name: int(name.removeprefix("episode_"))):
-            group = file[name]
-            keys = ("observations", "actions", "rewards", "terminations", "truncations")
-            missing = [key for key in keys if key not in group]
+        size = path.stat().st_size
+        numbers = sorted(int(name.removeprefix("episode_")) for name in file if EPISODE.fullmatch(name))
+        if not numbers:
+            raise InputError("has no episodes: must have at least one")
+        for number in numbers:
+            name = f"episode_{number}"
+            group = find_item(file, name)
+            missing = [key for key in ("observations", "actions") if key not in group]
             if missing:
-                raise InputError(f"{name} has no {', '.join(missing)}: must have {', '.join(keys)}")
-            yield _episode(name, {key: read_array(group, key) for key in keys})
+                raise InputError(f"{name} has no {', '.join(missing)}: must have observations and actions")
+            yield from _episode(number, {key: find_array(group, key, size) for key in NAMES if key in group})
 
 
-def _stored_episodes(data: Path, metadata: dict[str, Any]) -> Iterator[dict[str, np.ndarray]]:
-    """Episodes of the layouts that minari itself reads (arrow)."""
-    # Without both spaces minari would make the environment that the file names, which runs code the file chooses.
-    if not {"observation_space", "action_space"} <= set(metadata):
-        raise InputError(f"{METADATA_FILE} lacks observation_space or action_space: must have both")
-    layout = metadata["data_format"]
-    try:
-        from minari.dataset.minari_storage import MinariStorage
-
-        storage = MinariStorage.read(data)
-    except ImportError:
-        raise InputError(f"data_format is {layout!r}, which needs pyarrow: run `pip install pyarrow`") from None
-    for stored in storage.get_episodes(range(storage.total_episodes)):
-        columns = {key: np.asarray(value) for key, value in stored.items() if key not in ("id", "infos")}
-        yield _episode(f"episode_{stored['id']}", columns)
-
-
-def _episode(name: str, stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    rows = len(stored["actions"])
-    if rows == 0 or len(stored["observations"]) != rows + 1:
-        found = f"{rows} actions and {len(stored['observations'])} observations"
-        raise InputError(f"{name} has {found}: must have T actions and T+1 observations, T at least 1")
-    names = {"actions": "actions", "rewards": "rewards", "terminations": "terminated", "truncations": "truncated"}
-    for key in names:
-        if len(stored[key]) != rows:
-            raise InputError(f"{name} has {len(stored[key])} {key} and {rows} actions: both must be equal")
-    states = {"observations": stored["observations"][:-1], "next_observations": stored["observations"][1:]}
-    return {**states, **{field: stored[key] for key, field in names.items()}}
+def _arrow_pieces(data: Path, layout: str) -> Iterator[Rows]:
+    """Episodes that lie in folders of their own, as arrow or parquet files of T+1 rows."""
+    # Not minari's own reader: it would make the environment that a file names, which runs code of the file's choice.
+    numbers = sorted(int(place.name) for place in data.iterdir() if place.name.isdecimal() and place.is_dir())
+    if not numbers:
+        raise InputError("has no episodes: must have at least one")
+    read = {"arrow": read_ipc, "parquet": read_parquet_whole}[layout]
+    for number in numbers:
+        files = sorted((data / str(number)).glob(f"*.{layout}"))
+        if len(files) != 1:
+            raise InputError(f"episode {number} has {len(files)} .{layout} files: must have one")
+        stored = read(files[0], NAMES)
+        missing = [key for key in ("observations", "actions") if key not in stored]
+        if missing:
+            raise InputError(f"episode_{number} has no {', '.join(missing)}: must have observations and actions")
+        # The last row holds the final observation; its action and flags only fill the table up.
+        yield from _episode(number, {k: array if k == "observations" else array[:-1] for k, array in stored.items()})
 
 
-def _join(name: str, episodes: list[dict[str, np.ndarray]]) -> np.ndarray:
-    shapes = {episode[name].shape[1:] for episode in episodes}
-    if len(shapes) > 1:
-        raise InputError(f"{name} has columns {sorted(shapes)} in different episodes: must have the same in all")
-    return np.concatenate([episode[name] for episode in episodes])
+def _episode(number: int, stored: dict[str, Any]) -> Iterator[Rows]:
+    """Pieces of one episode's arrays, which have shape, dtype and slices."""
+    shapes = {key: array.shape[:1] for key, array in stored.items()}
+    (rows, *_), (observed, *_) = shapes["actions"] or (0,), shapes["observations"] or (0,)
+    if rows == 0 or observed != rows + 1:
+        found = f"{rows} actions and {observed} observations"
+        raise InputError(f"episode_{number} has {found}: must have T actions and T+1 observations, T at least 1")
+    for key, shape in shapes.items():
+        if key != "observations" and shape != (rows,):
+            raise InputError(f"episode_{number} has {shape[0] if shape else 0} {key} and {rows} actions: must be equal")
+    arrays = {field: stored[key] for key, field in NAMES.items() if key in stored}
+    for piece in row_pieces({**arrays, "observations": WithoutLast(arrays["observations"])}):
+        count = len(piece["observations"])
+        yield {**piece, "episode": np.full(count, number)}
+
+
+class WithoutLast:
+    """An array of rows, less the last one, that is not read before it is sliced."""
+
+    def __init__(self, array: Any):
+        self.array, self.dtype = array, array.dtype
+        self.shape = (array.shape[0] - 1, *array.shape[1:])
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return self.array[rows]

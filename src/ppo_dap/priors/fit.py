@@ -22,6 +22,7 @@ from ppo_dap.priors.prior import DiffusionPrior, scale_actions
 PROBE_ROWS = 256
 VALIDATION_ROWS = 8192
 SMALLEST_SIGMA_DATA = 0.05
+MOMENT_ROWS = 2**18
 FIT_STREAM = 3
 """Keeps the fit's random numbers apart from those of the split of episodes."""
 
@@ -89,7 +90,7 @@ def fit_diffusion(logs: Logs, seed: int, progress: Progress | None, options: dic
         action_high=high,
         task=logs.task,
         logs_hash=logs.hash(),
-        training={"seed": seed, **training},
+        training={"seed": seed, **training} | ({} if logs.drawn is None else {"drawn": dict(logs.drawn)}),
         probe_observations=np.asarray(train.observations)[chosen],
         probe_actions=np.asarray(train.actions)[chosen],
     )
@@ -109,7 +110,7 @@ def _bounds(logs: Logs, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     try:
         bounds = [np.broadcast_to(np.asarray(bound, np.float32), (size,)).copy() for bound in (low, high)]
     except ValueError:
-        raise InputError(f"action_low and action_high must be a number or {size} numbers") from None
+        raise InputError(f"action_low {low} and action_high {high} must be a number or {size} numbers") from None
     if not (np.all(np.isfinite(bounds)) and np.all(bounds[0] <= bounds[1])):
         raise InputError(f"action_low {low} and action_high {high} must be finite, low <= high")
     return bounds[0], bounds[1], rest
@@ -164,9 +165,8 @@ def train_denoiser(
 
 def init_state(rows: Rows, config: DiffusionConfig, rng: np.random.Generator) -> FitState:
     """A fresh denoiser with the rows' moments; a constant observation gets spread 1, so that it stays constant."""
-    std = np.std(np.asarray(rows.observations, np.float64), axis=0)
-    sigma_data = max(float(np.std(np.asarray(rows.actions, np.float64))), SMALLEST_SIGMA_DATA)
-    mean = np.mean(np.asarray(rows.observations, np.float64), axis=0)
+    mean, std = _moments(np.asarray(rows.observations))
+    sigma_data = max(float(_moments(np.asarray(rows.actions).reshape(-1, 1))[1][0]), SMALLEST_SIGMA_DATA)
     denoiser = Denoiser.create(
         rng,
         config,
@@ -176,6 +176,17 @@ def init_state(rows: Rows, config: DiffusionConfig, rng: np.random.Generator) ->
         rows.actions.shape[1],
     )
     return FitState(denoiser, denoiser, _optimizer(config).init(denoiser), jnp.zeros((), jnp.int32))
+
+
+def _moments(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2 columns"]:
+    """Mean and standard deviation in float64, a piece at a time: a copy of all would be twice the logs."""
+    pieces = np.split(values, range(MOMENT_ROWS, len(values), MOMENT_ROWS))
+    mean, square = np.zeros((2, values.shape[1]))
+    for piece in pieces:
+        mean += np.sum(piece, axis=0, dtype=np.float64) / len(values)
+    for piece in pieces:
+        square += np.sum(np.square(piece - mean), axis=0) / len(values)
+    return np.stack([mean, np.sqrt(square)])
 
 
 def _optimizer(config: DiffusionConfig) -> Any:  # optax's own type knows no pytrees but arrays and dicts

@@ -43,8 +43,8 @@ def collect_episodes(
             for i in np.flatnonzero(step.valid):
                 open_rows[i].append((observations[i], actions[i], step.rewards[i], step.terminated[i]))
                 if step.terminated[i] or step.truncated[i]:
-                    columns = (np.stack(column) for column in zip(*open_rows[i], strict=True))
-                    episodes.append(Episode(*columns, step.next_observations[i]))
+                    seen, acted, rewards, ended = (np.stack(column) for column in zip(*open_rows[i], strict=True))
+                    episodes.append(Episode(seen, acted, rewards, ended, step.next_observations[i]))
                     collected += len(open_rows[i])
                     open_rows[i] = []
             observations = step.observations

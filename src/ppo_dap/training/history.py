@@ -78,8 +78,8 @@ def _in_order(rollouts: Sequence[dict[str, np.ndarray]]) -> list[Episode]:
         ended = (segment["terminated"] | segment["truncated"])[times, env]
         for piece in np.split(times, np.flatnonzero(ended) + 1):
             if len(piece):
-                columns = (segment[name][piece, env] for name in ("observations", "actions", "rewards", "terminated"))
-                found.append((piece[0], env, Episode(*columns, finals[piece[-1], env])))
+                rows = {name: segment[name][piece, env] for name in Episode._fields[:-1]}
+                found.append((piece[0], env, Episode(**rows, final_observation=finals[piece[-1], env])))
     return [episode for _, _, episode in sorted(found, key=lambda entry: entry[:2])]
 
 

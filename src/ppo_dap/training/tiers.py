@@ -118,6 +118,10 @@ def tier_episodes(
     `behaviours` are runs of one task: one for every tier but `mixed`, which takes `MIXED_RUNS`.
     """
     first = behaviours[0]
+    for behaviour in behaviours if tier != "random" else ():
+        if behaviour.expert == behaviour.random:
+            steps = behaviour.run.config["config"]["steps"]
+            raise InputError(f"no policy of {behaviour.run.folder} is better than its first: {steps} steps are too few")
     if tier == "medium-replay":
         return thin(first.replay(), rows), [first.about(first.random), first.about(first.medium)]
     chosen = {
@@ -192,6 +196,12 @@ def estimate(task: str, tiers: Sequence[str], rows: int, seed: int, steps: int, 
     collected = sum(tier != "medium-replay" for tier in missing)
     if not (runs or collected):
         return 0.0
+    speed = speed_of(task)
+    return runs * steps / (TRAINING_SHARE * speed) + collected * rows / speed
+
+
+def speed_of(task: str) -> float:
+    """Steps per second of the bare environments, from half a second of random actions."""
     env = make_vector_env(task, 8, seed=0)
     spec, rng, count = describe(task), np.random.default_rng(0), 0
     try:
@@ -200,10 +210,9 @@ def estimate(task: str, tiers: Sequence[str], rows: int, seed: int, steps: int, 
         while time.perf_counter() < start + 0.5:
             env.step(rng.uniform(spec.action_low, spec.action_high, (8, spec.action_size)).astype(np.float32))
             count += 8
-        speed = count / (time.perf_counter() - start)
+        return count / (time.perf_counter() - start)
     finally:
         env.close()
-    return runs * steps / (TRAINING_SHARE * speed) + collected * rows / speed
 
 
 def check_tiers(tiers: Sequence[str]) -> None:

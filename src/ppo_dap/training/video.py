@@ -56,7 +56,9 @@ def _make(task: str) -> Any:
     model = getattr(env.unwrapped, "model", None)
     if type(model).__name__ != "MjModel":
         return env
-    import mujoco
+    import mujoco as bindings
+
+    mujoco: Any = bindings  # its stubs do not say what is in it
 
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA) < 0:
         return env
