@@ -50,6 +50,13 @@ def test_what_we_write_loads_to_the_same_hash(root, options):
     assert (minari.load_dataset("made-v0").env_spec is None) == bool(options)
 
 
+def test_a_relative_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    logs = make_logs(task="Pendulum-v1", **BOUNDS)
+    assert save_minari(logs, "hand/made-v1", CARD, root="logs") == tmp_path / "logs" / "hand" / "made-v1"
+    assert load_logs("logs/hand/made-v1").hash() == logs.hash()
+
+
 def test_unbounded_actions_and_no_task(root):
     save_minari(make_logs(), "made-v0", {})
     assert json.loads((root / "made-v0" / "data" / "metadata.json").read_text()).get("env_spec") is None

@@ -38,7 +38,8 @@ def save_minari(
     The folder is there in full or not at all. Raises `InputError` for logs without rewards or `terminated`, an id that
     is none or is taken, a task that Gymnasium does not know, and a card that cannot be written.
     """
-    folder = Path(root).expanduser() / dataset_id if root is not None else minari_root() / dataset_id
+    # Minari looks for its own file below a relative folder twice over.
+    folder = (minari_root() if root is None else Path(root).expanduser()).absolute() / dataset_id
     metadata = _metadata(logs, dataset_id, card, final_observations)
     if folder.exists():
         raise InputError(f"{folder} is there already: must be a new dataset, such as the next -v")
