@@ -111,7 +111,7 @@ def test_flatten_is_the_inverse_of_replace():
 def test_field_names_are_unique_over_groups():
     names = [f.name for cls in typing.get_type_hints(Config).values() for f in dataclasses.fields(cls)]
     assert len(names) == len(set(names)) == len(field_groups()) == len(flatten(Config()))
-    assert set(NUMBERS) | set(CHOICES) | {"tensorboard", "pin_core"} == set(names)
+    assert set(NUMBERS) | set(CHOICES) | {"tensorboard", "pin_core", "keep_history"} == set(names)
 
 
 def test_every_number_has_a_rule():

@@ -152,7 +152,7 @@ def test_damaged_hdf5(tmp_path):
         ({"data_format": "arrow"}, "has no episodes: must have at least one"),
         ({"data_format": "tape"}, "data_format is 'tape': must be hdf5, arrow or parquet"),
         ({"env_spec": "{"}, "metadata is not JSON"),
-        ({"env_spec": '{"id": 3}'}, "env_spec has id 3: must be a Gymnasium id"),
+        ({"env_spec": '{"id": 3}'}, "the dataset's task is 3: must be an id"),
     ],
 )
 def test_bad_minari_metadata(minari_folder, space, match):

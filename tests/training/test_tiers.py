@@ -152,6 +152,23 @@ def test_the_estimate_counts_what_is_missing(store, tmp_path, monkeypatch):
     assert tiers.estimate(TASK, list(tiers.TIERS), ROWS, SEED, STEPS, store) == 0
 
 
+def test_tasks_that_gymnasium_does_not_know_get_logs_too(store, tmp_path):
+    episodes, _ = tiers.tier_episodes("random", 100, SEED, [tiers.behave(TASK, SEED, STEPS, store / "behaviours")])
+    made = {"tier": "random", "meaning": "m", "policies": [], "command": "c", "versions": {}}
+    sizes = {"observations": 23, "actions": 7}
+    empty = [
+        episode._replace(
+            **{name: np.zeros((len(episode.rewards), size), np.float32) for name, size in sizes.items()},
+            final_observation=np.zeros(23, np.float32),
+        )
+        for episode in episodes
+    ]
+    tiers._write("Striker-v2", empty, made, tmp_path, 0.0, 0.0)
+    logs = ppo_dap.load_logs(tmp_path / "striker-v2" / "random-v0")
+    assert logs.task == "Striker-v2"
+    assert logs.hash() == json.loads((tmp_path / "striker-v2" / "random-v0" / "card.json").read_text())["sha256"]
+
+
 def test_a_run_that_learned_nothing_makes_no_tier(store):
     behaviour = tiers.behave(TASK, SEED, STEPS, store / "behaviours")
     behaviour.__dict__["returns"] = dict.fromkeys(behaviour.returns, 1.0)

@@ -76,9 +76,10 @@ def _metadata(data: Path) -> dict[str, Any]:
 
 def _task(metadata: dict[str, Any]) -> str | None:
     spec = metadata.get("env_spec")
-    task = json.loads(spec)["id"] if spec else None
+    # Without an environment of Gymnasium's, our own datasets name their task beside the data.
+    task = json.loads(spec)["id"] if spec else metadata.get("task")
     if task is not None and not isinstance(task, str):
-        raise InputError(f"env_spec has id {task!r}: must be a Gymnasium id")
+        raise InputError(f"the dataset's task is {task!r}: must be an id such as Hopper-v5")
     return task
 
 

@@ -174,13 +174,23 @@ def _write(
     name = out.relative_to(folder).as_posix()
     logs = as_logs(episodes, task=task, source=name, action_low=spec.action_low, action_high=spec.action_high)
     finals = np.stack([episode.final_observation for episode in episodes])
-    said = {"algorithm_name": "PPO", "description": f"{made['tier']}: {made['meaning']}"}
+    said = {"algorithm_name": "PPO", "description": f"{made['tier']}: {made['meaning']}", "task": task}
     shutil.rmtree(out, ignore_errors=True)  # without its card it is half of a dataset
-    save_minari(logs, name, said, root=folder, final_observations=finals, env_spec=spec.backend != "mujoco")
+    save_minari(logs, name, said, root=folder, final_observations=finals, env_spec=_registered(task))
     seconds = {"seconds": round(time.perf_counter() - start, 1), "training_seconds": round(trained, 1)}
     card = describe_logs(logs) | made | seconds
     write_atomically(out / "README.md", card_text(name, card).encode())
     write_atomically(out / CARD, json.dumps(card, indent=1).encode())
+
+
+def _registered(task: str) -> bool:
+    """Whether Gymnasium knows the id: not Striker's, nor a class's import path."""
+    import gymnasium
+
+    try:
+        return gymnasium.spec(task) is not None
+    except gymnasium.error.Error:
+        return False
 
 
 def runs_needed(tier: str) -> int:

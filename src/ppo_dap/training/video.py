@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,9 @@ def _film(env: Any, policy: Policy, observation: Any, frame: Any, partial: Path,
     every = max(1, round(rate / FRAMES_PER_SECOND))
     frames, steps, ended = 0, 0, False
     # The default of macro_block_size would resize odd pictures with a warning; 2 is what the codec needs.
-    with imageio.get_writer(partial, fps=rate / every, macro_block_size=2) as film:
+    with warnings.catch_warnings(), imageio.get_writer(partial, fps=rate / every, macro_block_size=2) as film:
+        # JAX warns of every fork; imageio's child does nothing but become ffmpeg.
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
         while not ended:
             if steps % every == 0:
                 film.append_data(frame if steps == 0 else env.render())  # type: ignore[attr-defined]
