@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from logs.hostile_made import MAKERS, Payload
+from logs.hostile_made import MAKERS
+from logs.hostile_tools import Payload
 from logs.logs_made import make_logs, write_npz
 
 COUNT = 300

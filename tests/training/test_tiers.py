@@ -169,6 +169,11 @@ def test_tasks_that_gymnasium_does_not_know_get_logs_too(store, tmp_path):
     assert logs.hash() == json.loads((tmp_path / "striker-v2" / "random-v0" / "card.json").read_text())["sha256"]
 
 
+def test_python_is_told_of_unknown_tiers_too(tmp_path):
+    with pytest.raises(InputError, match="unknown tier 'good'"):
+        tiers.make_tier(TASK, "good", ROWS, SEED, STEPS, tmp_path)
+
+
 def test_a_run_that_learned_nothing_makes_no_tier(store):
     behaviour = tiers.behave(TASK, SEED, STEPS, store / "behaviours")
     behaviour.__dict__["returns"] = dict.fromkeys(behaviour.returns, 1.0)

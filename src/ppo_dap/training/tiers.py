@@ -145,6 +145,7 @@ def make_tier(task: str, tier: str, rows: int, seed: int, steps: int, folder: Pa
 
     A dataset that is there already stays as it is; raises `InputError` if it was made otherwise.
     """
+    check_tiers([tier])
     out = tier_folder(task, tier, folder)
     command = f"ppo-dap collect --task {task} --tier {tier} --steps {rows} --train-steps {steps} --seed {seed}"
     if not (out / CARD).is_file():
