@@ -8,12 +8,12 @@ letter, `tuned` is the best that our own studies found (docs/results.md says on 
 from __future__ import annotations
 
 import dataclasses
-import math
 import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ppo_dap.errors import InputError, unknown
+from ppo_dap.fields import AT_LEAST_0, POSITIVE, SHARE, Rule, validate_fields
 
 
 @dataclass(frozen=True)
@@ -222,26 +222,23 @@ def flatten(config: Config) -> dict[str, Any]:
 
 
 # name -> (predicate, what would be right); every number a user can set is in here.
-_positive = (lambda v: v > 0, "a number above 0")
-_at_least_0 = (lambda v: v >= 0, "a number of 0 or more")
-_share = (lambda v: 0 < v <= 1, "a number above 0 and at most 1")
 # fmt: off
-_RULES: dict[str, tuple[Any, str]] = {
+_RULES: dict[str, Rule] = {
     **dict.fromkeys(
         ("num_envs", "rollout_steps", "minibatch_size", "num_epochs", "hidden_size", "num_proposals", "sampler_steps",
          "q_hidden_size", "q_epochs", "pet_minibatch_size", "adapter_rank", "warm_start_epochs", "steps",
          "eval_episodes", "checkpoint_every", "threads", "learning_rate", "max_grad_norm", "kl_target",
          "observation_clip", "reward_clip", "guidance_cap", "proxy_std_floor", "q_learning_rate", "pet_learning_rate",
          "warm_start_std_floor", "clip_epsilon"),
-        _positive,
+        POSITIVE,
     ),
     **dict.fromkeys(
         ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every",
 ),
-        _at_least_0,
+        AT_LEAST_0,
     ),
     "seed": (lambda v: 0 <= v < 2**32, "a number from 0 to 4294967295"),
-    **dict.fromkeys(["proposal_fraction", "beta_anneal"], _share),
+    **dict.fromkeys(["proposal_fraction", "beta_anneal"], SHARE),
     **dict.fromkeys(("gamma", "gae_lambda"), (lambda v: 0 <= v <= 1, "a number from 0 to 1")),
     **dict.fromkeys(("displacement_cap", "top_k"), (lambda v: v is None or v > 0, "a number above 0, or None")),
     "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),
@@ -251,10 +248,8 @@ _RULES: dict[str, tuple[Any, str]] = {
 
 def validate(config: Config) -> None:
     """Raise `InputError` for the first field whose type or value cannot work, naming what would be right."""
-    for group, cls in typing.get_type_hints(Config).items():
-        hints = typing.get_type_hints(cls)
-        for f in dataclasses.fields(cls):
-            _validate_field(f.name, getattr(getattr(config, group), f.name), hints[f.name])
+    for group in typing.get_type_hints(Config):
+        validate_fields(getattr(config, group), _RULES)
     ppo = config.ppo
     if ppo.rollout_steps % ppo.num_envs:
         raise InputError(f"rollout_steps {ppo.rollout_steps} must be a multiple of num_envs {ppo.num_envs}")
@@ -273,20 +268,3 @@ _FLOATS = frozenset(
     if float in (typing.get_args(typing.get_type_hints(cls)[f.name]) or (typing.get_type_hints(cls)[f.name],))
 )
 """Fields that take a number; a whole one given for it becomes a float."""
-
-
-def _validate_field(name: str, value: Any, hint: Any) -> None:
-    if typing.get_origin(hint) is Literal:
-        if value not in typing.get_args(hint):
-            raise unknown(f"value of {name}", value, typing.get_args(hint))
-        return
-    allowed = typing.get_args(hint) or (hint,)
-    right_type = (isinstance(value, allowed) or (float in allowed and isinstance(value, int))) and (
-        bool in allowed or not isinstance(value, bool)
-    )
-    if not right_type:
-        kinds = " or ".join("None" if t is type(None) else t.__name__ for t in allowed)
-        raise InputError(f"{name} must be {kinds}, not {value!r}")
-    finite = not isinstance(value, float) or math.isfinite(value)
-    if name in _RULES and not (finite and _RULES[name][0](value)):
-        raise InputError(f"{name} must be {_RULES[name][1]}, not {value!r}")

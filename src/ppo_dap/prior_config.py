@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-from ppo_dap.errors import InputError, unknown
+from ppo_dap.errors import InputError
+from ppo_dap.fields import AT_LEAST_0, POSITIVE, validate_fields
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,7 @@ class DiffusionConfig:
     """Denoising steps of `Prior.sample`."""
 
     def __post_init__(self):
-        for f in dataclasses.fields(self):
-            _validate(f.name, getattr(self, f.name), f.default)
+        validate_fields(self, _RULES)
         if not self.sigma_min < self.sigma_max:
             raise InputError(f"sigma_min {self.sigma_min} must be below sigma_max {self.sigma_max}")
         for name in ("validation_fraction", "ema_decay"):
@@ -62,22 +62,5 @@ class DiffusionConfig:
                 raise InputError(f"{name} must be below 1, not {getattr(self, name)!r}")
 
 
-_MAY_BE_ZERO = ("num_conditions", "warmup_steps", "ema_decay")
-_CHOICES = {
-    "noise_distribution": ("lognormal", "loguniform"),
-    "loss_weighting": ("edm", "none"),
-    "sampler": ("ancestral", "dpmpp_2m"),
-}
-
-
-def _validate(name: str, value: Any, default: object) -> None:
-    """Refuse a value that is not of its default's type, or not in its range."""
-    if name in _CHOICES:
-        if value not in _CHOICES[name]:
-            raise unknown(f"value of {name}", value, _CHOICES[name])
-        return
-    kind, right = (int, "an integer") if isinstance(default, int) else (int | float, "a number")
-    right += " of 0 or more" if name in _MAY_BE_ZERO else " above 0"
-    is_number = isinstance(value, kind) and not isinstance(value, bool)
-    if not (is_number and (value >= 0 if name in _MAY_BE_ZERO else value > 0)):
-        raise InputError(f"{name} must be {right}, not {value!r}")
+_RULES = {f.name: POSITIVE for f in dataclasses.fields(DiffusionConfig)}
+_RULES |= dict.fromkeys(("num_conditions", "warmup_steps", "ema_decay"), AT_LEAST_0)
