@@ -63,8 +63,8 @@ def require_compatible(logs: Logs, *, task: str, observation_size: int, action_s
 
     Warns with `LogsWarning` when only the version differs, as "Hopper-v2" and "Hopper-v5".
     """
-    if logs.task is not None and _family(logs.task) != _family(task):
-        right = f"logs of {_family(task)}, or --task {logs.task}"
+    if logs.task is not None and family(logs.task) != family(task):
+        right = f"logs of {family(task)}, or --task {logs.task}"
         raise InputError(f"{logs.source}: the logs are of task {logs.task!r}, not {task!r}: must be {right}")
     finding = _dimensions(logs, observation_size, action_size)
     if finding.level == "error":
@@ -74,9 +74,10 @@ def require_compatible(logs: Logs, *, task: str, observation_size: int, action_s
         warnings.warn(f"{logs.source}: {message}", LogsWarning, stacklevel=2)
 
 
-def _family(task: str) -> str:
-    family, version, number = task.rpartition("-v")
-    return family if version and number.isdigit() else task
+def family(task: str) -> str:
+    """The task's id without its version."""
+    name, version, number = task.rpartition("-v")
+    return name if version and number.isdigit() else task
 
 
 def _task(logs: Logs, task: str | None) -> Finding:
@@ -84,9 +85,9 @@ def _task(logs: Logs, task: str | None) -> Finding:
         known = task or logs.task
         return Finding("ok", "task", known or "unknown: give --task to check dimensions and action bounds")
     message = f"the logs are of {logs.task}, checked against {task}"
-    if _family(task) == _family(logs.task):
+    if family(task) == family(logs.task):
         return Finding("warning", "task", f"{message}: versions differ in physics and rewards")
-    return Finding("error", "task", f"{message}: use logs of {_family(task)}, or --task {logs.task}")
+    return Finding("error", "task", f"{message}: use logs of {family(task)}, or --task {logs.task}")
 
 
 def _dimensions(logs: Logs, observation_size: int | None, action_size: int | None) -> Finding:

@@ -1,7 +1,7 @@
 """Many copies of Striker-v2 on one MuJoCo model: the same bits as Gymnasium's route, without its cost per copy.
 
 The copies are stepped one by one. `mujoco.rollout` is no faster here, and between calls it forgets what the solver
-starts from, which changes the bits (docs/tasks.md has the figures).
+starts from, which changes the bits.
 """
 
 from __future__ import annotations

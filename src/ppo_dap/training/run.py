@@ -16,6 +16,7 @@ from ppo_dap.config import Config
 from ppo_dap.dap import audit
 from ppo_dap.errors import InputError
 from ppo_dap.logs import Logs, load_logs, require_compatible
+from ppo_dap.logs.check import family
 from ppo_dap.methods import Method, get_method, resolve
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy, load_policy
@@ -188,7 +189,7 @@ def _check_prior(method: Method, prior: Any, spec: TaskSpec) -> DiffusionPrior |
                 f"the prior was fitted to logs of {prior.task or 'another task'} with {name} {getattr(prior, name)}; "
                 f"{spec.task} has {name} {getattr(spec, name)}: fit a prior to logs of {spec.task}"
             )
-    if prior.task is not None and prior.task.split("-v")[0] != spec.task.split("-v")[0]:
+    if prior.task is not None and family(prior.task) != family(spec.task):
         raise InputError(f"the prior was fitted to logs of {prior.task}, not of {spec.task}")
     if not (np.allclose(prior.action_low, spec.action_low) and np.allclose(prior.action_high, spec.action_high)):
         raise InputError(
