@@ -4,34 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 from ppo_dap.errors import InputError
-from ppo_dap.fields import AT_LEAST_0, POSITIVE, validate_fields
+from ppo_dap.fields import AT_LEAST_0, POSITIVE, SHARE, Rule, validate_fields
+
+CONDITIONS = {"none": 0, "return": 2}
+"""What a prior can be conditioned on beside the observation, and how many numbers that takes."""
 
 
 @dataclass(frozen=True)
-class DiffusionConfig:
-    """Network, noise range, fit and default sampler of a diffusion prior."""
+class FitConfig:
+    """What the fit of every trained prior has."""
 
-    width: int = 96
-    """Units of the layers that see the noisy action: what sampling costs."""
-    depth: int = 1
-    """Hidden layers between the first and the output layer: the place of the adapters."""
-    state_width: int = 128
-    """Units of the two layers that see the state, once for all proposals and steps."""
-    num_conditions: int = 0
-    """Numbers beside the observation that the prior is conditioned on."""
-    sigma_min: float = 0.02
-    """Smallest noise level, in scaled actions."""
-    sigma_max: float = 5.0
-    """Largest noise level; must exceed the box's width for the start to forget the action."""
-    rho: float = 7.0
-    """Spacing of the sampling levels (Karras et al., Eq. 5)."""
-    noise_distribution: Literal["lognormal", "loguniform"] = "lognormal"
-    """P(sigma) of Eq. 6."""
-    loss_weighting: Literal["edm", "none"] = "edm"
-    """Weight of a noise level in the loss: Karras et al.'s, which lets each level count the same, or Eq. 6 as is."""
+    kind: ClassVar[str]
+    rules: ClassVar[dict[str, Rule]] = {}
+    """Of the kind's own fields, where they are no numbers above 0."""
+    condition_on: Literal["none", "return"] = "none"
+    """What the prior can be asked for: nothing, or the return of the episode that an action comes from (then the logs
+    need rewards)."""
+    condition_dropout: float = 0.2
+    """Share of the rows whose condition is hidden in the fit, so that the prior can also be asked for nothing."""
     batch_size: int = 512
     """Rows of one step of the fit."""
     learning_rate: float = 5e-3
@@ -48,19 +41,57 @@ class DiffusionConfig:
     """Decay of the averaged weights, which are the ones that are validated and kept."""
     validation_fraction: float = 0.1
     """Share of the episodes that is held out."""
+
+    def __post_init__(self):
+        validate_fields(self, field_rules(type(self)))
+        for name in ("validation_fraction", "ema_decay"):
+            if getattr(self, name) >= 1:
+                raise InputError(f"{name} must be below 1, not {getattr(self, name)!r}")
+
+    @property
+    def num_conditions(self) -> int:
+        """Numbers beside the observation that the prior is conditioned on."""
+        return CONDITIONS[self.condition_on]
+
+
+@dataclass(frozen=True)
+class DiffusionConfig(FitConfig):
+    """Network, noise range, fit and default sampler of a diffusion prior."""
+
+    kind = "diffusion"
+    width: int = 96
+    """Units of the layers that see the noisy action: what sampling costs."""
+    depth: int = 1
+    """Hidden layers between the first and the output layer: the place of the adapters."""
+    state_width: int = 128
+    """Units of the two layers that see the state, once for all proposals and steps."""
+    sigma_min: float = 0.02
+    """Smallest noise level, in scaled actions."""
+    sigma_max: float = 5.0
+    """Largest noise level; must exceed the box's width for the start to forget the action."""
+    rho: float = 7.0
+    """Spacing of the sampling levels (Karras et al., Eq. 5)."""
+    noise_distribution: Literal["lognormal", "loguniform"] = "lognormal"
+    """P(sigma) of Eq. 6."""
+    loss_weighting: Literal["edm", "none"] = "edm"
+    """Weight of a noise level in the loss: Karras et al.'s, which lets each level count the same, or Eq. 6 as is."""
     sampler: Literal["ancestral", "dpmpp_2m"] = "ancestral"
     """Solver of `Prior.sample`."""
     sampler_steps: int = 20
     """Denoising steps of `Prior.sample`."""
 
     def __post_init__(self):
-        validate_fields(self, _RULES)
+        super().__post_init__()
         if not self.sigma_min < self.sigma_max:
             raise InputError(f"sigma_min {self.sigma_min} must be below sigma_max {self.sigma_max}")
-        for name in ("validation_fraction", "ema_decay"):
-            if getattr(self, name) >= 1:
-                raise InputError(f"{name} must be below 1, not {getattr(self, name)!r}")
 
 
-_RULES = {f.name: POSITIVE for f in dataclasses.fields(DiffusionConfig)}
-_RULES |= dict.fromkeys(("num_conditions", "warmup_steps", "ema_decay"), AT_LEAST_0)
+PRIOR_CONFIGS: dict[str, Any] = {config.kind: config for config in (DiffusionConfig,)}
+"""Kind of prior -> its settings."""
+
+
+def field_rules(config: type) -> dict[str, Rule]:
+    """What is right for each field of a prior's settings."""
+    rules = {f.name: POSITIVE for f in dataclasses.fields(config)}
+    rules |= dict.fromkeys(("warmup_steps", "ema_decay"), AT_LEAST_0)
+    return rules | {"condition_dropout": SHARE} | config.rules  # type: ignore[attr-defined]

@@ -10,7 +10,9 @@ sys.path.insert(0, str(Path(__file__).parent))  # for `truths`
 from truths import TwoModes
 
 from ppo_dap.logs import Logs
-from ppo_dap.priors.fit import Rows, fit_prior, train_denoiser
+from ppo_dap.prior_config import DiffusionConfig
+from ppo_dap.priors.diffusion import Denoiser
+from ppo_dap.priors.fit import Rows, fit_prior, train_network
 
 SMALL = {"width": 64, "depth": 1, "batch_size": 256, "max_steps": 1500, "chunk_steps": 250, "ema_decay": 0.99}
 
@@ -39,13 +41,11 @@ def prior(logs):
 @pytest.fixture(scope="session")
 def labelled():
     """A denoiser fitted to actions near -0.5 under the label -1 and near 0.5 under the label 1."""
-    from ppo_dap.priors.diffusion import DiffusionConfig
-
     rng = np.random.default_rng(1)
     label = rng.choice([-1.0, 1.0], (8000, 1))
     actions = 0.5 * label + 0.1 * rng.standard_normal((8000, 1))
-    rows = Rows(*(jnp.asarray(a, jnp.float32) for a in (rng.standard_normal((8000, 2)), label, actions)))
-    config = DiffusionConfig(**{**SMALL, "width": 32, "max_steps": 600, "chunk_steps": 200}, num_conditions=1)
+    condition = np.concatenate([label, np.ones_like(label)], axis=1)
+    rows = Rows(*(jnp.asarray(a, jnp.float32) for a in (rng.standard_normal((8000, 2)), condition, actions)))
+    config = DiffusionConfig(**{**SMALL, "width": 32, "max_steps": 600, "chunk_steps": 200}, condition_on="return")
     held_out = Rows(*(a[7000:] for a in rows))
-    denoiser, _ = train_denoiser(Rows(*(a[:7000] for a in rows)), held_out, config, 0)
-    return denoiser, config
+    return train_network(Denoiser, Rows(*(a[:7000] for a in rows)), held_out, config, 0)[0]

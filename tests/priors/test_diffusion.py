@@ -10,9 +10,16 @@ from scipy import stats
 
 from ppo_dap.errors import InputError
 from ppo_dap.nets.mlp import Linear
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, LossDraws, denoising_loss, noise_features, spread_sigmas
-from ppo_dap.priors.fit import Rows, train_denoiser
-from ppo_dap.priors.samplers import Solver, sample_actions
+from ppo_dap.priors.diffusion import (
+    Denoiser,
+    DiffusionConfig,
+    LossDraws,
+    denoising_loss,
+    noise_features,
+    spread_sigmas,
+)
+from ppo_dap.priors.fit import Rows, train_network
+from ppo_dap.priors.samplers import Solver
 
 SD = 0.2
 
@@ -70,7 +77,7 @@ def gaussian_fit():
     rows = Rows(*(jnp.asarray(a, jnp.float32) for a in (states, np.zeros((len(states), 0)), actions)))
     config = DiffusionConfig(width=64, depth=1, batch_size=512, max_steps=1500, chunk_steps=300, ema_decay=0.995)
     held_out = Rows(*(a[54_000:] for a in rows))
-    denoiser, _ = train_denoiser(Rows(*(a[:54_000] for a in rows)), held_out, config, 0)
+    denoiser, _ = train_network(Denoiser, Rows(*(a[:54_000] for a in rows)), held_out, config, 0)
     return denoiser, config
 
 
@@ -158,14 +165,17 @@ def test_moments_of_the_logs_do_not_move(gaussian_fit):
 
 
 def test_condition_conditions(labelled):
-    denoiser, config = labelled
-    solver = Solver(config.sampler, config.sampler_steps)
-    noise = jax.random.normal(jax.random.key(0), solver.noise_shape(50, 20, 1))
+    solver = Solver("ancestral", 20)
+    noise = jax.random.normal(jax.random.key(0), labelled.noise_shape(solver, 50, 20))
     for label in (-1.0, 1.0):
-        condition = jnp.full((50, 1), label)
-        actions, _ = sample_actions(denoiser, None, jnp.zeros((50, 2)), condition, noise, solver, config)
+        condition = jnp.asarray(np.tile([label, 1.0], (50, 1)), jnp.float32)
+        actions, _ = labelled.sample(jnp.zeros((50, 2)), condition, noise, solver)
         assert float(jnp.mean(actions)) == pytest.approx(0.5 * label, abs=0.03)
         assert float(jnp.std(actions)) == pytest.approx(0.1, abs=0.03)
+    # Asked for nothing it gives what both labels give together.
+    actions, _ = labelled.sample(jnp.zeros((50, 2)), jnp.zeros((50, 2)), noise, solver)
+    assert float(jnp.mean(actions > 0)) == pytest.approx(0.5, abs=0.08)
+    assert float(jnp.std(actions)) > 0.35  # each alone: 0.1
 
 
 @pytest.mark.parametrize(

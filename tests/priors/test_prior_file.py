@@ -35,7 +35,7 @@ def test_a_loaded_prior_is_the_same_prior(prior, tmp_path):
         loaded.sample(states, jax.random.key(1), 5), prior.sample(states, jax.random.key(1), 5)
     )
     for field in dataclasses.fields(prior):
-        if field.name != "denoiser":
+        if field.name != "network":
             np.testing.assert_equal(getattr(loaded, field.name), getattr(prior, field.name))
 
 
@@ -93,8 +93,12 @@ def test_newer_format(prior, tmp_path):
     refuse(rewritten(saved(prior, tmp_path), format=99), "format 99")
 
 
+def test_older_format(prior, tmp_path):
+    refuse(rewritten(saved(prior, tmp_path), format=1), "older ppo-dap: fit the prior again")
+
+
 def test_missing_or_misshapen_arrays(prior, tmp_path):
-    refuse(rewritten(saved(prior, tmp_path), drop="denoiser.out.weight"), "nothing for denoiser.out.weight")
+    refuse(rewritten(saved(prior, tmp_path), drop="network.out.weight"), "nothing for network.out.weight")
     refuse(rewritten(saved(prior, tmp_path), drop="action_low"), "action_low is missing")
 
 
@@ -108,5 +112,5 @@ def test_unreadable_header(prior, tmp_path):
 def test_wrong_sizes_are_refused(prior):
     with pytest.raises(InputError, match="observations have 3 numbers, the prior's 2"):
         prior.sample(np.zeros((4, 3)), jax.random.key(0), 2)
-    with pytest.raises(InputError, match="condition has 1 numbers, the prior's 0"):
-        prior.sample(np.zeros((4, 2)), jax.random.key(0), 2, np.zeros((4, 1)))
+    with pytest.raises(InputError, match="fitted with condition_on 'return'; this one was not"):
+        prior.sample(np.zeros((4, 2)), jax.random.key(0), 2, asked="top")

@@ -8,9 +8,10 @@ import pytest
 from truths import TwoModes, energy, moment_matched
 
 from ppo_dap.errors import InputError, TrainingDiverged
+from ppo_dap.prior_config import DiffusionConfig
 from ppo_dap.priors import fit
-from ppo_dap.priors.diffusion import DiffusionConfig
-from ppo_dap.priors.fit import Rows, fit_prior, train_denoiser
+from ppo_dap.priors.diffusion import Denoiser
+from ppo_dap.priors.fit import Rows, fit_prior, train_network
 
 QUICK = {"width": 8, "depth": 1, "batch_size": 32, "max_steps": 20, "chunk_steps": 10}
 
@@ -22,7 +23,8 @@ def in_scaled_units(actions):
 @pytest.mark.parametrize("sampler", ["ancestral", "dpmpp_2m"])
 def test_fitted_prior_has_the_distribution_of_the_logs(prior, sampler):
     states = np.array([[0.3, -0.6], [-0.5, 0.5], [0.8, 0.1]])
-    chosen = dataclasses.replace(prior, config=dataclasses.replace(prior.config, sampler=sampler))
+    config = dataclasses.replace(prior.config, sampler=sampler)
+    chosen = dataclasses.replace(prior, network=dataclasses.replace(prior.network, config=config))
     samples = in_scaled_units(chosen.sample(states, jax.random.key(0), 1000))
     truths = TwoModes().sample(states, 1000, np.random.default_rng(5))
     for x, truth in zip(samples, truths, strict=True):
@@ -33,7 +35,7 @@ def test_fitted_prior_has_the_distribution_of_the_logs(prior, sampler):
 def test_fit_knows_its_logs(prior, logs):
     assert (prior.kind, prior.observation_size, prior.action_size, prior.task) == ("diffusion", 2, 2, "Toy-v0")
     assert prior.logs_hash == logs.hash()
-    assert float(prior.denoiser.sigma_data) == pytest.approx(np.std(in_scaled_units(logs.actions)), rel=0.01)
+    assert float(prior.network.sigma_data) == pytest.approx(np.std(in_scaled_units(logs.actions)), rel=0.01)
     assert prior.training["steps"] >= prior.training["best_step"] > 0
     known = {tuple(row) for row in np.asarray(logs.observations)}
     assert len(prior.probe_observations) == 256
@@ -50,9 +52,9 @@ def test_samples_are_within_the_bounds(prior):
 
 def test_same_seed_same_bits(logs):
     first, again, other = (fit_prior(logs, seed=seed, **QUICK) for seed in (1, 1, 2))
-    weights = [jax.tree.leaves(p.denoiser) for p in (first, again, other)]
+    weights = [jax.tree.leaves(p.network) for p in (first, again, other)]
     assert all(np.array_equal(a, b) for a, b in zip(weights[0], weights[1], strict=True))
-    assert not np.array_equal(first.denoiser.out.weight, other.denoiser.out.weight)
+    assert not np.array_equal(first.network.out.weight, other.network.out.weight)
 
 
 def test_progress_is_told_of_every_chunk(logs):
@@ -70,14 +72,14 @@ def scripted(monkeypatch, losses):
     def chunk(state, train, held_out, picks, draws, held_out_draws, config):
         look = len(calls)
         calls.append((held_out, held_out_draws, picks, draws))
-        marked = fit.Denoiser(**{**vars(state.ema), "sigma_data": jnp.asarray(float(look))})
+        marked = Denoiser(**{**vars(state.ema), "sigma_data": jnp.asarray(float(look))})
         state = state._replace(ema=marked, step=state.step + config.chunk_steps)
         return state, (jnp.asarray(1.0), jnp.asarray(losses[look]))
 
     monkeypatch.setattr(fit, "train_chunk", chunk)
     rows = Rows(jnp.ones((40, 1)), jnp.zeros((40, 0)), jnp.ones((40, 1)))
     config = DiffusionConfig(**{**QUICK, "max_steps": 80, "patience": 3})
-    return train_denoiser(rows, rows, config, 0), calls
+    return train_network(Denoiser, rows, rows, config, 0), calls
 
 
 def test_early_stopping_keeps_the_best(monkeypatch):
@@ -88,7 +90,7 @@ def test_early_stopping_keeps_the_best(monkeypatch):
         assert held_out is calls[0][0]
         assert held_out_draws is calls[0][1]
     for one, two in pairwise(calls):  # the steps between two looks have rows and noise of their own
-        assert all(np.all(a != b) for a, b in zip(one[3], two[3], strict=True))
+        assert all(np.all(a != b) for a, b in zip(one[3].loss, two[3].loss, strict=True))
         assert np.mean(one[2] != two[2]) > 0.9
 
 
@@ -102,8 +104,8 @@ def test_constant_observations_and_actions_outside_the_bounds(logs):
     states = np.stack([rng.standard_normal(len(logs.actions)), np.full(len(logs.actions), 7.0)], axis=1)
     odd = dataclasses.replace(logs, observations=states, actions=rng.uniform(-9, 9, logs.actions.shape))
     prior = fit_prior(odd, **QUICK)
-    np.testing.assert_allclose(prior.denoiser.observation_mean[1], 7.0)
-    assert float(prior.denoiser.observation_std[1]) == 1.0
+    np.testing.assert_allclose(prior.network.observation_mean[1], 7.0)
+    assert float(prior.network.observation_std[1]) == 1.0
     assert np.abs(prior.probe_actions).max() == 1.0
     assert np.all(np.isfinite(prior.sample(states[:4], jax.random.key(0), 3)))
 
@@ -125,5 +127,5 @@ def test_unknown_names_are_refused(logs):
         fit_prior(logs, kind="difusion")
     with pytest.raises(InputError, match="did you mean 'learning_rate'"):
         fit_prior(logs, lerning_rate=1e-3)
-    with pytest.raises(InputError, match="num_conditions must be 0"):
-        fit_prior(logs, num_conditions=1)
+    with pytest.raises(InputError, match="condition_on 'return' needs logs with rewards"):
+        fit_prior(logs, condition_on="return")

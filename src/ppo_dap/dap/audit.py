@@ -23,8 +23,8 @@ from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
 from ppo_dap.nets.adapters import Adapters
 from ppo_dap.ppo.surrogate import weighted_mean
 from ppo_dap.ppo.update import Normaliser, Rows, ppo_loss
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-from ppo_dap.priors.samplers import Solver, sample_actions
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, sample_actions
+from ppo_dap.priors.samplers import Solver
 
 DELTA = 1e-8
 PROXY_STATES = 16

@@ -22,8 +22,8 @@ from ppo_dap.dap.guidance import (
 )
 from ppo_dap.nets.adapters import Adapters
 from ppo_dap.nets.critic import QFunction
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-from ppo_dap.priors.samplers import Field, Solver, sample_actions
+from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, sample_actions
+from ppo_dap.priors.samplers import Field, Solver
 
 
 class Proposals(eqx.Module):

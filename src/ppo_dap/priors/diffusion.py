@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ppo_dap.nets.adapters import Adapters, apply_hidden
+from ppo_dap.nets.adapters import Adapters, apply_hidden, merge
 from ppo_dap.nets.mlp import MLP, Linear, silu
 from ppo_dap.prior_config import DiffusionConfig
+from ppo_dap.priors.samplers import SAMPLERS, Field, Solver, centred_start, karras_sigmas
 
 NOISE_FREQUENCIES = 8
 OBSERVATION_CLIP = 10.0
@@ -37,6 +38,7 @@ class Denoiser(eqx.Module):
     observation_mean: Float[Array, " obs"]
     observation_std: Float[Array, " obs"]
     sigma_data: Float[Array, ""]
+    config: DiffusionConfig = eqx.field(static=True)
 
     @staticmethod
     def create(
@@ -61,7 +63,41 @@ class Denoiser(eqx.Module):
             observation_mean=observation_mean,
             observation_std=observation_std,
             sigma_data=sigma_data,
+            config=config,
         )
+
+    def noise_shape(self, solver: Solver, states: int, num: int) -> tuple[int, ...]:
+        """Shape of the unit noise of `sample`."""
+        return solver.noise_shape(states, num, self.out.weight.shape[0])
+
+    def sample(
+        self,
+        observations: Float[Array, "n obs"],
+        condition: Float[Array, "n c"],
+        noise: Float[Array, "draws n k act"],
+        solver: Solver,
+        adapters: Adapters | None = None,
+        drift: Field | None = None,
+        displacement_cap: float | None = None,
+    ) -> tuple[Float[Array, "n k act"], Float[Array, "n k"]]:
+        """k actions a state, and how far guidance moved each."""
+        options = {"drift": drift, "displacement_cap": displacement_cap}
+        return sample_actions(self, adapters, observations, condition, noise, solver, self.config, **options)
+
+    def draw_loss(self, rng: np.random.Generator, *shape: int) -> LossDraws:
+        """The random numbers of `loss` over rows of `shape`, (*steps, n)."""
+        return LossDraws.make(rng, *shape, self.out.weight.shape[0])
+
+    def loss(
+        self,
+        observations: Float[Array, "n obs"],
+        condition: Float[Array, "n c"],
+        actions: Float[Array, "n act"],
+        draws: LossDraws,
+        adapters: Adapters | None = None,
+    ) -> Float[Array, ""]:
+        """Eq. 6; in the adapters alone, L_PET."""
+        return denoising_loss(self, adapters, observations, condition, actions, draws, self.config)
 
     def embed(
         self, observations: Float[Array, "n obs"], condition: Float[Array, "n c"]
@@ -161,3 +197,28 @@ def denoising_loss(
     if config.loss_weighting == "edm":
         errors = errors * (jnp.square(sigma) + jnp.square(sigma_data)) / jnp.square(sigma * sigma_data)
     return jnp.mean(errors)
+
+
+def sample_actions(
+    denoiser: Denoiser,
+    adapters: Adapters | None,
+    observations: Float[Array, "n obs"],
+    condition: Float[Array, "n c"],
+    noise: Float[Array, "draws n k act"],
+    solver: Solver,
+    config: DiffusionConfig,
+    *,
+    drift: Field | None = None,
+    displacement_cap: float | Float[Array, ""] | None = None,
+) -> tuple[Float[Array, "n k act"], Float[Array, "n k"]]:
+    """k actions a state from `noise` of the shape `solver.noise_shape` gives, and how far guidance moved each."""
+    denoiser, adapters = merge(denoiser, adapters)
+    embedding = denoiser.embed(observations, condition)
+    sigmas = karras_sigmas(solver.num_steps, config.sigma_min, config.sigma_max, config.rho)
+
+    def denoise(x, sigma):
+        return denoiser(x, embedding, sigma, adapters)
+
+    if solver.name == "dpmpp_2m":
+        noise = centred_start(denoise, sigmas[0], noise[0])[None]
+    return SAMPLERS[solver.name](denoise, sigmas, noise, drift, displacement_cap)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,13 +16,17 @@ from jaxtyping import Array, Float, Int
 
 from ppo_dap.errors import InputError, TrainingDiverged, unknown
 from ppo_dap.logs.dataset import Logs
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, LossDraws, denoising_loss
-from ppo_dap.priors.prior import DiffusionPrior, scale_actions
+from ppo_dap.prior_config import PRIOR_CONFIGS
+from ppo_dap.priors.kinds import NETWORKS
+from ppo_dap.priors.network import Network
+from ppo_dap.priors.prior import Prior, asked_return, scale_actions
 
 PROBE_ROWS = 256
 VALIDATION_ROWS = 8192
-SMALLEST_SIGMA_DATA = 0.05
+SMALLEST_SPREAD = 0.05
 MOMENT_ROWS = 2**18
+ASKED_SHARE = 0.95
+"""Who asks for the top return asks for this quantile of the logged ones."""
 FIT_STREAM = 3
 """Keeps the fit's random numbers apart from those of the split of episodes."""
 
@@ -33,6 +37,15 @@ class Rows(NamedTuple):
     observations: Float[Array, "rows obs"]
     condition: Float[Array, "rows c"]
     actions: Float[Array, "rows act"]
+
+
+class Draws(NamedTuple):
+    """Random numbers of a chunk of steps."""
+
+    loss: Any
+    """As the network draws them."""
+    shown: Float[Array, "steps batch #c"]
+    """1, or 0 where a row's condition is hidden."""
 
 
 class FitProgress(NamedTuple):
@@ -48,8 +61,8 @@ class FitProgress(NamedTuple):
 class FitState(NamedTuple):
     """Everything that changes from step to step."""
 
-    denoiser: Denoiser
-    ema: Denoiser
+    network: Network
+    ema: Network
     optimizer: Any
     step: Array
 
@@ -59,33 +72,30 @@ Progress = Callable[[FitProgress], None]
 
 def fit_prior(
     logs: Logs, kind: str = "diffusion", *, seed: int = 0, progress: Progress | None = None, **options: Any
-) -> DiffusionPrior:
-    """Fit a prior of the given kind to `logs`.
+) -> Prior:
+    """Fit a prior of the given kind to `logs`, stopped on held-out episodes.
 
-    Options are the fields of the kind's config (`DiffusionConfig`), and `action_low` and `action_high` for logs that
-    do not carry the action space's bounds, or carry infinite ones.
+    Options are the fields of the kind's config (`DiffusionConfig` and so on), and `action_low` and `action_high` for
+    logs that do not carry the action space's bounds, or carry infinite ones.
     """
-    if kind not in _FITTERS:
-        raise unknown("prior kind", kind, _FITTERS)
-    return _FITTERS[kind](logs, seed, progress, options)
-
-
-def fit_diffusion(logs: Logs, seed: int, progress: Progress | None, options: dict[str, Any]) -> DiffusionPrior:
-    """Stage I for the diffusion prior: Eq. 6 on the logs' rows, stopped on held-out episodes."""
+    config_class = PRIOR_CONFIGS.get(kind)
+    if config_class is None:
+        raise unknown("prior kind", kind, PRIOR_CONFIGS)
     low, high, options = _bounds(logs, options)
-    known = [f.name for f in dataclasses.fields(DiffusionConfig)]
+    known = [f.name for f in dataclasses.fields(config_class)]
     for name in options:
         if name not in known:
-            raise unknown("option of the diffusion prior", name, [*known, "action_low", "action_high"])
-    config = DiffusionConfig(**options)
-    if config.num_conditions:
-        raise InputError("num_conditions must be 0: logs carry no condition (use train_denoiser with rows that do)")
-    train, held_out = (_rows(part, low, high) for part in logs.split(config.validation_fraction, seed))
-    denoiser, training = train_denoiser(train, held_out, config, seed, progress)
+            raise unknown(f"option of the {kind} prior", name, [*known, "action_low", "action_high"])
+    config = config_class(**options)
+    if config.condition_on == "return" and logs.rewards is None:
+        raise InputError("condition_on 'return' needs logs with rewards; these have none: use condition_on 'none'")
+    parts = logs.split(config.validation_fraction, seed)
+    asks = return_conditions(parts[0]) if config.condition_on == "return" else {}
+    train, held_out = (_rows(part, low, high, asks) for part in parts)
+    network, training = train_network(NETWORKS[kind], train, held_out, config, seed, progress)
     chosen = np.random.default_rng(seed).permutation(train.actions.shape[0])[:PROBE_ROWS]
-    return DiffusionPrior(
-        denoiser=denoiser,
-        config=config,
+    return Prior(
+        network=network,
         action_low=low,
         action_high=high,
         task=logs.task,
@@ -93,10 +103,8 @@ def fit_diffusion(logs: Logs, seed: int, progress: Progress | None, options: dic
         training={"seed": seed, **training} | ({} if logs.drawn is None else {"drawn": dict(logs.drawn)}),
         probe_observations=np.asarray(train.observations)[chosen],
         probe_actions=np.asarray(train.actions)[chosen],
+        asks=asks,
     )
-
-
-_FITTERS = {"diffusion": fit_diffusion}
 
 
 def _bounds(logs: Logs, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
@@ -116,35 +124,57 @@ def _bounds(logs: Logs, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     return bounds[0], bounds[1], rest
 
 
-def _rows(logs: Logs, low: np.ndarray, high: np.ndarray) -> Rows:
+def return_conditions(logs: Logs) -> dict[str, float]:
+    """Mean, spread and 95th percentile (`top`) of the episode's return over the rows of `logs`."""
+    returns = row_returns(logs)
+    return {"mean": float(returns.mean()), "std": float(returns.std()), "top": float(np.quantile(returns, ASKED_SHARE))}
+
+
+def row_returns(logs: Logs) -> Float[np.ndarray, " rows"]:
+    """The return of the episode that each row is of, undiscounted."""
+    returns = logs.episode_returns()
+    assert returns is not None  # `fit_prior` has checked
+    return np.repeat(returns, logs.episode_lengths()).astype(np.float64)
+
+
+def _rows(logs: Logs, low: np.ndarray, high: np.ndarray, asks: Mapping[str, float]) -> Rows:
     observations = np.asarray(logs.observations, np.float32)
     actions = scale_actions(np.asarray(logs.actions, np.float32), low, high)
-    empty = np.zeros((observations.shape[0], 0), np.float32)
-    return Rows(*(jnp.asarray(a) for a in (observations, empty, actions)))
+    condition = np.zeros((observations.shape[0], 0), np.float32)
+    if asks:
+        condition = asked_return(row_returns(logs), asks)
+    return Rows(*(jnp.asarray(a) for a in (observations, condition, actions)))
 
 
-def train_denoiser(
-    train: Rows, held_out: Rows, config: DiffusionConfig, seed: int, progress: Progress | None = None
-) -> tuple[Denoiser, dict[str, Any]]:
-    """Minimise Eq. 6 on `train`; returns the averaged weights that were best on `held_out`, and a summary."""
+def train_network(
+    network_class: Any,
+    train: Rows,
+    held_out: Rows,
+    config: Any,
+    seed: int,
+    progress: Progress | None = None,
+) -> tuple[Any, dict[str, Any]]:
+    """Minimise the network's loss on `train`; returns the averaged weights that were best on `held_out`, and a summary.
+
+    Of Eq. 6, for the diffusion prior.
+    """
     rng = np.random.default_rng([seed, FIT_STREAM])
-    state = init_state(train, config, rng)
+    state = init_state(network_class, train, config, rng)
     # A fixed random subset, in random order and with the same noise at every look: looks differ by the weights alone.
     picked = rng.permutation(held_out.actions.shape[0])[:VALIDATION_ROWS]
     held_out = Rows(*(a[picked] for a in held_out))
-    held_out_draws = LossDraws.make(rng, *held_out.actions.shape)
-    size, act = (config.chunk_steps, config.batch_size), train.actions.shape[1]
+    held_out_draws = state.network.draw_loss(rng, len(picked))
+    size = (config.chunk_steps, config.batch_size)
     best, best_loss, best_step, step, train_loss = state.ema, float("inf"), 0, 0, float("nan")
     start = time.perf_counter()
     while step < config.max_steps:
         picks = rng.integers(0, train.actions.shape[0], size, dtype=np.int32)
-        state, losses = train_chunk(
-            state, train, held_out, picks, LossDraws.make(rng, *size, act), held_out_draws, config
-        )
+        draws = Draws(state.network.draw_loss(rng, *size), _shown(rng, size, config))
+        state, losses = train_chunk(state, train, held_out, picks, draws, held_out_draws, config)
         step = int(state.step)
         train_loss, validation_loss = (float(loss) for loss in losses)
         if not (np.isfinite(train_loss) and np.isfinite(validation_loss)):
-            raise TrainingDiverged(f"fit of the prior: the denoising loss is not finite at step {step}")
+            raise TrainingDiverged(f"fit of the prior: the loss is not finite at step {step}")
         if validation_loss < best_loss:
             best, best_loss, best_step = state.ema, validation_loss, step
         if progress is not None:
@@ -163,19 +193,26 @@ def train_denoiser(
     return best, summary
 
 
-def init_state(rows: Rows, config: DiffusionConfig, rng: np.random.Generator) -> FitState:
-    """A fresh denoiser with the rows' moments; a constant observation gets spread 1, so that it stays constant."""
+def _shown(rng: np.random.Generator, size: tuple[int, int], config: Any) -> np.ndarray:
+    """1 for each row whose condition the fit sees, 0 for those where it is hidden."""
+    if not config.num_conditions:
+        return np.ones((*size, 0), np.float32)
+    return (rng.random((*size, 1)) >= config.condition_dropout).astype(np.float32)
+
+
+def init_state(network_class: Any, rows: Rows, config: Any, rng: np.random.Generator) -> FitState:
+    """A fresh network with the rows' moments; a constant observation gets spread 1, so that it stays constant."""
     mean, std = _moments(np.asarray(rows.observations))
-    sigma_data = max(float(_moments(np.asarray(rows.actions).reshape(-1, 1))[1][0]), SMALLEST_SIGMA_DATA)
-    denoiser = Denoiser.create(
+    spread = max(float(_moments(np.asarray(rows.actions).reshape(-1, 1))[1][0]), SMALLEST_SPREAD)
+    network = network_class.create(
         rng,
         config,
         jnp.asarray(mean, jnp.float32),
         jnp.asarray(np.where(std > 1e-6, std, 1.0), jnp.float32),
-        jnp.asarray(sigma_data, jnp.float32),
+        jnp.asarray(spread, jnp.float32),
         rows.actions.shape[1],
     )
-    return FitState(denoiser, denoiser, _optimizer(config).init(denoiser), jnp.zeros((), jnp.int32))
+    return FitState(network, network, _optimizer(config).init(network), jnp.zeros((), jnp.int32))
 
 
 def _moments(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2 columns"]:
@@ -189,7 +226,7 @@ def _moments(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2 
     return np.stack([mean, np.sqrt(square)])
 
 
-def _optimizer(config: DiffusionConfig) -> Any:  # optax's own type knows no pytrees but arrays and dicts
+def _optimizer(config: Any) -> Any:  # optax's own type knows no pytrees but arrays and dicts
     warmup = min(config.warmup_steps, config.max_steps // 2)
     schedule = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, config.max_steps)
     return optax.chain(optax.clip_by_global_norm(10.0), optax.adam(schedule, b2=0.99))
@@ -201,25 +238,27 @@ def train_chunk(
     train: Rows,
     held_out: Rows,
     picks: Int[Array, "steps batch"],
-    draws: LossDraws,
-    held_out_draws: LossDraws,
-    config: DiffusionConfig,
+    draws: Draws,
+    held_out_draws: Any,
+    config: Any,
 ) -> tuple[FitState, tuple[Float[Array, ""], Float[Array, ""]]]:
     """Steps on the picked rows as one program; the mean training loss, and the averaged weights' held-out loss."""
     optimizer = _optimizer(config)
 
     def step(state: FitState, inputs):
-        picked, noise = inputs
-        batch = Rows(*(a[picked] for a in train))
-        loss, gradient = jax.value_and_grad(denoising_loss)(state.denoiser, None, *batch, noise, config)
+        picked, (noise, shown) = inputs
+        observations, condition, actions = (a[picked] for a in train)
+        loss, gradient = jax.value_and_grad(lambda n: n.loss(observations, condition * shown, actions, noise))(
+            state.network
+        )
         updates, moments = optimizer.update(gradient, state.optimizer)
-        denoiser = jax.tree.map(jnp.add, state.denoiser, updates)
+        network = jax.tree.map(jnp.add, state.network, updates)
         # Early averages must not remember the random start.
         decay = jnp.minimum(config.ema_decay, (1.0 + state.step) / (10.0 + state.step))
         # Written as a step towards the weights, so that what does not change keeps its bits.
-        ema = jax.tree.map(lambda e, w: e + (1 - decay) * (w - e), state.ema, denoiser)
-        return FitState(denoiser, ema, moments, state.step + 1), loss
+        ema = jax.tree.map(lambda e, w: e + (1 - decay) * (w - e), state.ema, network)
+        return FitState(network, ema, moments, state.step + 1), loss
 
     state, losses = jax.lax.scan(step, state, (picks, draws))
-    validation = denoising_loss(state.ema, None, *held_out, held_out_draws, config)
+    validation = state.ema.loss(*held_out, held_out_draws)
     return state, (jnp.mean(losses), validation)

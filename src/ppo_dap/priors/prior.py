@@ -1,4 +1,4 @@
-"""What a prior is to its users, and the diffusion prior with its file.
+"""What a prior is to its users, and its file.
 
 Outside a prior actions are in the environment's units; inside they are scaled so that the action space's box is
 [-1, 1]. This module is the edge between the two.
@@ -7,10 +7,11 @@ Outside a prior actions are in the environment's units; inside they are scaled s
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,44 +19,15 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ppo_dap.errors import InputError, unknown
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-from ppo_dap.priors.samplers import Solver, sample_actions
+from ppo_dap.prior_config import PRIOR_CONFIGS
+from ppo_dap.priors.kinds import NETWORKS
+from ppo_dap.priors.samplers import Solver
 from ppo_dap.storage import read_tensors, tree_from_tensors, tree_to_tensors, write_tensors
 
-FORMAT = 1
-
-
-@runtime_checkable
-class Prior(Protocol):
-    """A conditional distribution over actions, p(a | s), that was fitted to logs."""
-
-    @property
-    def kind(self) -> str:
-        """Name of the family, as `fit_prior` takes it."""
-        ...
-
-    @property
-    def observation_size(self) -> int:
-        """Numbers of an observation."""
-        ...
-
-    @property
-    def action_size(self) -> int:
-        """Numbers of an action."""
-        ...
-
-    @property
-    def task(self) -> str | None:
-        """Task of the logs, where they say so."""
-        ...
-
-    def sample(self, observations: Any, key: PRNGKeyArray, num: int) -> Array:
-        """`num` actions a state in environment units, shape (n, num, act)."""
-        ...
-
-    def save(self, path: str | Path) -> None:
-        """Write the prior to `path`, to be read by `load_prior`."""
-        ...
+FORMAT = 2
+"""1 held diffusion priors alone."""
+Asked = Literal["none", "top"]
+"""What a prior that is conditioned on the return can be asked for: nothing in particular, or a high one."""
 
 
 def scale_actions(actions: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -73,14 +45,18 @@ def unscale_actions(
     return jnp.clip((high_ + low_) / 2 + scaled * (high_ - low_) / 2, low_, high_)
 
 
-@dataclass(frozen=True, eq=False)
-class DiffusionPrior:
-    """The action prior of Section 4.2: a denoiser and what is needed to use, check and audit it."""
+def asked_return(returns: Float[np.ndarray, " n"], asks: Mapping[str, float]) -> Float[np.ndarray, "n 2"]:
+    """The condition that stands for these returns: in the logs' standard deviations, and 1 for "known"."""
+    scaled = (np.asarray(returns) - asks["mean"]) / max(asks["std"], 1e-6)
+    return np.stack([scaled, np.ones_like(scaled)], axis=1).astype(np.float32)
 
-    denoiser: Denoiser
-    """The backbone, with the logs' observation moments and sigma_data."""
-    config: DiffusionConfig
-    """Settings it was fitted with; its sampler is the default of `sample`."""
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A conditional distribution over actions, p(a | s), that was fitted to logs (Section 4.2), of any kind."""
+
+    network: Any
+    """The fitted `Network`, with the logs' observation moments."""
     action_low: Float[np.ndarray, " act"]
     """Lower bounds of the action space."""
     action_high: Float[np.ndarray, " act"]
@@ -95,100 +71,104 @@ class DiffusionPrior:
     """Observations of a few rows of the logs, for the leakage audit alone (Eq. 11 needs an offline minibatch)."""
     probe_actions: Float[np.ndarray, "probe act"]
     """Scaled actions of the same rows."""
+    asks: dict[str, float] = field(default_factory=dict)
+    """Mean, spread and top quantile of the logged returns, for a prior that is conditioned on them; else empty."""
 
-    kind = "diffusion"
+    @property
+    def kind(self) -> str:
+        """Name of the family, as `fit_prior` takes it."""
+        return self.config.kind
+
+    @property
+    def config(self) -> Any:
+        """Settings it was fitted with; a diffusion prior's sampler is the default of `sample`."""
+        return self.network.config
 
     @property
     def observation_size(self) -> int:
         """Numbers of an observation."""
-        return self.denoiser.observation_mean.shape[0]
+        return self.probe_observations.shape[1]
 
     @property
     def action_size(self) -> int:
         """Numbers of an action."""
         return self.action_low.shape[0]
 
+    def condition(self, asked: Asked) -> Float[np.ndarray, " c"]:
+        """The condition that asks for the `top` return, or for `none`.
+
+        Raises `InputError` if the prior was not conditioned on the return and is asked for one.
+        """
+        if asked == "none":
+            return np.zeros(self.config.num_conditions, np.float32)
+        if not self.asks:
+            raise InputError(
+                f"prior_return {asked!r} needs a prior that was fitted with condition_on 'return'; this one was not"
+            )
+        return asked_return(np.array([self.asks[asked]]), self.asks)[0]
+
     def sample(
         self,
         observations: Float[Array, "n obs"] | Float[np.ndarray, "n obs"],
         key: PRNGKeyArray,
         num: int,
-        condition: Float[Array, "n c"] | Float[np.ndarray, "n c"] | None = None,
+        asked: Asked = "none",
     ) -> Float[Array, "n {num} act"]:
         """`num` actions a state, in environment units."""
         if observations.shape[1] != self.observation_size:
             raise InputError(f"observations have {observations.shape[1]} numbers, the prior's {self.observation_size}")
-        wanted = self.config.num_conditions
-        if condition is None:
-            condition = np.zeros((observations.shape[0], 0), np.float32)
-        if condition.shape[1] != wanted:
-            raise InputError(f"condition has {condition.shape[1]} numbers, the prior's {wanted}")
-        inputs = jnp.asarray(observations, jnp.float32), jnp.asarray(condition, jnp.float32)
-        solver = Solver(self.config.sampler, self.config.sampler_steps)
-        noise = jax.random.normal(key, solver.noise_shape(observations.shape[0], num, self.action_size))
-        scaled = _sample(self.denoiser, *inputs, noise, solver, self.config)
+        solver = Solver(getattr(self.config, "sampler", "ancestral"), getattr(self.config, "sampler_steps", 1))
+        noise = jax.random.normal(key, self.network.noise_shape(solver, observations.shape[0], num))
+        inputs = jnp.asarray(observations, jnp.float32), jnp.asarray(self.condition(asked))
+        scaled = _sample(self.network, *inputs, noise, solver)
         return unscale_actions(scaled, self.action_low, self.action_high)
 
     def save(self, path: str | Path) -> None:
         """Write the prior to exactly `path`."""
-        tensors = tree_to_tensors(self.denoiser, "denoiser")
+        tensors = tree_to_tensors(self.network, "network")
         for name in _ARRAYS:
             tensors[name] = getattr(self, name)
-        header = {
-            "kind": "prior",
-            "format": FORMAT,
-            "prior": self.kind,
-            "config": dataclasses.asdict(self.config),
-            "task": self.task,
-            "logs_hash": self.logs_hash,
-            "training": self.training,
-            "observation_size": self.observation_size,
-            "action_size": self.action_size,
-        }
+        header = {"kind": "prior", "format": FORMAT, "prior": self.kind, "config": dataclasses.asdict(self.config)}
+        header |= {name: getattr(self, name) for name in _HEADER}
         try:
             write_tensors(Path(path), tensors, header)
         except OSError as error:
             raise InputError(f"cannot write prior {path}: {error.strerror}") from error
 
-    @staticmethod
-    def from_file(tensors: dict[str, np.ndarray], header: dict[str, Any], source: object) -> DiffusionPrior:
-        """The prior that `save` wrote as `tensors` and `header`."""
-        config = DiffusionConfig(**header["config"])
-        sizes = (header["observation_size"],), (header["observation_size"],), ()
-        blank = jax.eval_shape(
-            lambda *m: Denoiser.create(np.random.default_rng(0), config, m[0], m[1], m[2], header["action_size"]),
-            *(jax.ShapeDtypeStruct(size, jnp.float32) for size in sizes),
-        )
-        missing = [name for name in _ARRAYS if name not in tensors]
-        if missing:
-            raise InputError(f"{source} is damaged: {missing[0]} is missing")
-        return DiffusionPrior(
-            denoiser=tree_from_tensors(blank, tensors, "denoiser", source),
-            config=config,
-            task=header["task"],
-            logs_hash=header["logs_hash"],
-            training=header["training"],
-            **{name: tensors[name] for name in _ARRAYS},
-        )
-
 
 _ARRAYS = ("action_low", "action_high", "probe_observations", "probe_actions")
+_HEADER = ("task", "logs_hash", "training", "asks")
 
 
-@partial(jax.jit, static_argnames=("solver", "config"))
-def _sample(denoiser, observations, condition, noise, solver, config):
-    return sample_actions(denoiser, None, observations, condition, noise, solver, config)[0]
-
-
-_KINDS = {"diffusion": DiffusionPrior}
+@partial(jax.jit, static_argnames="solver")
+def _sample(network, observations, condition, noise, solver):
+    condition = jnp.broadcast_to(condition[None], (observations.shape[0], condition.shape[0]))
+    return network.sample(observations, condition, noise, solver)[0]
 
 
 def load_prior(path: str | Path) -> Prior:
     """The prior that was saved to `path`."""
     tensors, header = read_tensors(Path(path), kind="prior", newest=FORMAT)
-    if header.get("prior") not in _KINDS:
-        raise InputError(f"{path}: {unknown('prior kind', header.get('prior'), _KINDS)}")
+    if header["format"] < FORMAT:
+        raise InputError(f"{path} was written by an older ppo-dap: fit the prior again with `ppo-dap pretrain`")
+    if header.get("prior") not in NETWORKS:
+        raise InputError(f"{path}: {unknown('prior kind', header.get('prior'), NETWORKS)}")
+    missing = [name for name in _ARRAYS if name not in tensors]
+    if missing:
+        raise InputError(f"{path} is damaged: {missing[0]} is missing")
     try:
-        return _KINDS[header["prior"]].from_file(tensors, header, path)
+        config = PRIOR_CONFIGS[header["prior"]](**header["config"])
+        others = {name: header[name] for name in _HEADER} | {name: tensors[name] for name in _ARRAYS}
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} is damaged: its header lacks or misnames {error}") from error
+    network = _read_network(NETWORKS[config.kind], config, tensors, path)
+    return Prior(network=network, **others)
+
+
+def _read_network(network_class: Any, config: Any, tensors: dict[str, np.ndarray], source: object) -> Any:
+    moments = [jax.ShapeDtypeStruct((tensors["probe_observations"].shape[1],), jnp.float32)] * 2
+    spread, action_size = jax.ShapeDtypeStruct((), jnp.float32), tensors["action_low"].shape[0]
+    blank = jax.eval_shape(
+        lambda *stats: network_class.create(np.random.default_rng(0), config, *stats, action_size), *moments, spread
+    )
+    return tree_from_tensors(blank, tensors, "network", source)

@@ -15,8 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ppo_dap.errors import unknown
-from ppo_dap.nets.adapters import Adapters, merge
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 
 Field = Callable[[Array, Array], Array]
 """A function of (x, sigma), shapes (n, k, act) and (), with the shape of x."""
@@ -124,28 +122,3 @@ class Solver(NamedTuple):
         if self.name not in SAMPLERS:
             raise unknown("sampler", self.name, SAMPLERS)
         return (1 if self.name == "dpmpp_2m" else self.num_steps + 1, *size)
-
-
-def sample_actions(
-    denoiser: Denoiser,
-    adapters: Adapters | None,
-    observations: Float[Array, "n obs"],
-    condition: Float[Array, "n c"],
-    noise: Float[Array, "draws n k act"],
-    solver: Solver,
-    config: DiffusionConfig,
-    *,
-    drift: Field | None = None,
-    displacement_cap: float | Float[Array, ""] | None = None,
-) -> tuple[Float[Array, "n k act"], Float[Array, "n k"]]:
-    """k actions a state from `noise` of the shape `solver.noise_shape` gives, and how far guidance moved each."""
-    denoiser, adapters = merge(denoiser, adapters)
-    embedding = denoiser.embed(observations, condition)
-    sigmas = karras_sigmas(solver.num_steps, config.sigma_min, config.sigma_max, config.rho)
-
-    def denoise(x, sigma):
-        return denoiser(x, embedding, sigma, adapters)
-
-    if solver.name == "dpmpp_2m":
-        noise = centred_start(denoise, sigmas[0], noise[0])[None]
-    return SAMPLERS[solver.name](denoise, sigmas, noise, drift, displacement_cap)

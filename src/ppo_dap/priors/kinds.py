@@ -1,0 +1,10 @@
+"""The kinds of priors: which network stands for which name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ppo_dap.priors.diffusion import Denoiser
+
+NETWORKS: dict[str, Any] = {"diffusion": Denoiser}
+"""Kind of prior -> its network; the settings of each are in `prior_config.PRIOR_CONFIGS`."""

@@ -1,0 +1,70 @@
+"""What every prior's network is: p(a | s, c) as a pytree of arrays, with its settings in a static field `config`.
+
+Sizes: n states, k actions a state, act action dimensions, obs observation dimensions, c numbers of condition. Inside a
+network actions are scaled: the action space's box is [-1, 1]. Observations are raw: a network has the moments of its
+logs. A condition of zeros asks for nothing in particular.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from ppo_dap.nets.adapters import Adapters
+from ppo_dap.priors.samplers import Field, Solver
+
+
+@runtime_checkable
+class Network(Protocol):
+    """A family of conditional distributions, of which an instance is one."""
+
+    config: Any
+    """Its settings, hashable."""
+
+    @staticmethod
+    def create(
+        rng: np.random.Generator,
+        config: Any,
+        observation_mean: Float[Array, " obs"],
+        observation_std: Float[Array, " obs"],
+        action_spread: Float[Array, ""],
+        action_size: int,
+    ) -> Network:
+        """A network before its fit, for logs with these moments (of all scaled actions together: their spread)."""
+        ...
+
+    def noise_shape(self, solver: Solver, states: int, num: int) -> tuple[int, ...]:
+        """Shape of the unit normal noise from which `num` actions for each of `states` are made."""
+        ...
+
+    def sample(
+        self,
+        observations: Float[Array, "n obs"],
+        condition: Float[Array, "n c"],
+        noise: Float[Array, ...],
+        solver: Solver,
+        adapters: Adapters | None = None,
+        drift: Field | None = None,
+        displacement_cap: float | None = None,
+    ) -> tuple[Float[Array, "n k act"], Float[Array, "n k"]]:
+        """k actions a state, within the box, and how far guidance moved each: a function of the noise and no other
+        randomness. `solver`, `adapters` and `drift` are the diffusion prior's; others are given None for the latter.
+        """
+        ...
+
+    def draw_loss(self, rng: np.random.Generator, *shape: int) -> Any:
+        """The random numbers of `loss` over rows of `shape`, (*steps, n), as a pytree with these leading axes."""
+        ...
+
+    def loss(
+        self,
+        observations: Float[Array, "n obs"],
+        condition: Float[Array, "n c"],
+        actions: Float[Array, "n act"],
+        draws: Any,
+        adapters: Adapters | None = None,
+    ) -> Float[Array, ""]:
+        """What the fit minimises."""
+        ...
