@@ -227,7 +227,7 @@ def test_a_heavy_import_is_found():
 def unknown_options(text: str) -> set[str]:
     """Options in `text` that no command has: neither a setting of a run, nor of the prior, nor common to all."""
     from ppo_dap.config import field_groups
-    from ppo_dap.priors.diffusion import DiffusionConfig
+    from ppo_dap.prior_config import DiffusionConfig
 
     known = {*field_groups(), *(field.name for field in dataclasses.fields(DiffusionConfig))}
     known |= {"preset", "task", "method", "logs", "prior", "out", "resume", "json"}

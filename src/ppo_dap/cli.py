@@ -12,13 +12,13 @@ import math
 import sys
 import typing
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 from ppo_dap import commands
 from ppo_dap import config as configs
 from ppo_dap.errors import InputError, PPODAPError, unknown
-from ppo_dap.prior_config import DiffusionConfig
+from ppo_dap.prior_config import PRIOR_CONFIGS
 
 
 class Parser(argparse.ArgumentParser):
@@ -101,24 +101,30 @@ def _from_logs_to_runs(command: Command) -> None:
     sub.add_argument("--json", action="store_true", help="print the findings as JSON")
     sub.add_argument("--html", metavar="FILE", help="write the findings and pictures to one .html file as well")
 
-    sub = command("pretrain", commands.pretrain, "Stage I: fit the diffusion prior to logs")
+    sub = command("pretrain", commands.pretrain, "Stage I: fit a prior to logs")
     _logs_option(sub, True)
     sub.add_argument("--task", metavar="ID", help="task of the logs, where they do not say (gives the action bounds)")
     for bound in ("low", "high"):
         text = f"{bound}est action, a number or one for each action (default: the task's, or as the logs say)"
         sub.add_argument(f"--action-{bound}", nargs="+", type=float, metavar="X", help=text)
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
+    sub.add_argument("--kind", default="diffusion", help=f"{', '.join(PRIOR_CONFIGS)} (default: %(default)s)")
+    _filter_option(sub)
     sub.add_argument("--coverage", default="wide", help="wide, medium or narrow: how much of the logs (default: wide)")
     sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit, and of the coverage (default: 0)")
     sub.add_argument("--quiet", action="store_true", help="print the result alone")
-    _field_options(sub.add_argument_group("the diffusion prior"), DiffusionConfig)
+    _prior_options(sub)
 
     sub = command("train", commands.train_run, "Stage II: train a method on a task")
     sub.add_argument(
         "--task", required=True, metavar="ID", help="a Gymnasium id, such as Hopper-v5, or package.module:Class"
     )
     sub.add_argument("--method", default="ppo-dap", help="see `ppo-dap methods` (default: %(default)s)")
-    sub.add_argument("--prior", metavar="FILE", help="prior that `ppo-dap pretrain` wrote")
+    sub.add_argument(
+        "--prior",
+        metavar="FILE",
+        help="prior that `ppo-dap pretrain` wrote, or random: the control that proposes anything",
+    )
     _logs_option(sub, False)
     sub.add_argument("--out", required=True, metavar="FOLDER", help="run folder")
     sub.add_argument("--preset", default="paper", help="paper (Table 2) or tuned (default: %(default)s)")
@@ -243,32 +249,66 @@ def _logs_option(parser: Parser, required: bool) -> None:
     )
 
 
+def _filter_option(parser: Parser) -> None:
+    parser.add_argument(
+        "--logs-filter",
+        type=_number(float, lambda v: 0 < v <= 1, "a number above 0 and at most 1"),
+        default=1.0,
+        metavar="SHARE",
+        help="share of the logs' rows to fit to: whole episodes, those of the highest return first (default: 1.0)",
+    )
+
+
 def _config_options(parser: Parser) -> None:
     """A flag for every field of the config, by its name; what is not given stays with the preset."""
     for group, cls in typing.get_type_hints(configs.Config).items():
         _field_options(parser.add_argument_group(f"{group}: {(cls.__doc__ or '').splitlines()[0]}"), cls)
 
 
-def _field_options(section: Any, cls: type) -> None:
-    """A flag for every field of a dataclass; what is not given is not in the result."""
+def _prior_options(parser: Parser) -> None:
+    """A flag for every field of every kind of prior; those that several kinds have are there once."""
+    kinds: dict[str, list[str]] = {}
+    for kind, cls in PRIOR_CONFIGS.items():
+        for f in dataclasses.fields(cls):
+            kinds.setdefault(f.name, []).append(kind)
+    seen: set[str] = set()
+    for kind, cls in PRIOR_CONFIGS.items():
+        section = parser.add_argument_group(f"{kind} prior: {(cls.__doc__ or '').splitlines()[0]}")
+        _field_options(section, cls, {name: others for name, others in kinds.items() if name not in seen})
+        seen |= {f.name for f in dataclasses.fields(cls)}
+
+
+def _field_options(section: Any, cls: type, shared: Mapping[str, Sequence[str]] | None = None) -> None:
+    """A flag for every field of a dataclass; what is not given is not in the result.
+
+    `shared` names the fields to take, and the kinds of prior that have each.
+    """
     hints, texts = typing.get_type_hints(cls), field_docstrings(cls)
     for f in dataclasses.fields(cls):
+        if shared is not None and f.name not in shared:
+            continue
+        others = shared[f.name] if shared is not None and len(shared[f.name]) > 1 else ()
+        defaults = {str(PRIOR_CONFIGS[kind].__dataclass_fields__[f.name].default) for kind in others} or {
+            str(f.default)
+        }
+        text = f"{texts[f.name]} (default: {' or '.join(sorted(defaults))})"
         section.add_argument(
             f"--{f.name.replace('_', '-')}",
             type=functools.partial(_parse_value, hints[f.name]),
             default=argparse.SUPPRESS,
             metavar="X",
-            help=f"{texts[f.name]} (default: {f.default})".replace("%", "%%"),
+            help=(text + (f" [{', '.join(others)}]" if others else "")).replace("%", "%%"),
         )
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """The string below each field of a dataclass."""
-    body = ast.parse(inspect.getsource(cls)).body[0].body  # type: ignore[attr-defined]
+    """The string below each field of a dataclass, its base's included."""
     texts = {}
-    for statement, after in itertools.pairwise(body):
-        if isinstance(statement, ast.AnnAssign) and isinstance(after, ast.Expr):
-            texts[statement.target.id] = " ".join(ast.literal_eval(after.value).split())  # type: ignore[union-attr]
+    for part in reversed(cls.__mro__[:-1]):
+        body = ast.parse(inspect.getsource(part)).body[0].body  # type: ignore[attr-defined]
+        for statement, after in itertools.pairwise(body):
+            if isinstance(statement, ast.AnnAssign) and isinstance(after, ast.Expr):
+                texts[statement.target.id] = " ".join(ast.literal_eval(after.value).split())  # type: ignore[union-attr]
     return texts
 
 

@@ -51,6 +51,18 @@ class PPOConfig:
     """Normalised observations are clipped to this many standard deviations."""
     reward_clip: float = 10.0
     """Scaled rewards are clipped to this absolute value."""
+    surrogate: Literal["clip", "authentic_boundary", "generalised_clip"] = "clip"
+    """Objective of the actor: Eq. 5, or the reconstructions of ABPPO's and of PPO-GC's (ppo/surrogate.py)."""
+    clip_slope: float = 0.1
+    """alpha: slope of the generalised clip outside the clip range; 0 is Eq. 5, 1 does not clip at all."""
+    boundary_kl: float | None = None
+    """delta: KL ball in nats, in which the authentic boundary bounds the ratio; None: the one for which the upper bound
+    is 1 + clip_epsilon on average, by the number of action dimensions."""
+    reuse_batches: int = 0
+    """1: PPO-ARC as reconstructed (ppo/reuse.py), an update on the current and the previous batch competes with PPO's,
+    which is not strictly on-policy and the audit reports it; 0: PPO."""
+    contest_kl_weight: float = 1.0
+    """beta: weight of the policy-KL in the score that decides PPO-ARC's contest."""
 
 
 @dataclass(frozen=True)
@@ -85,18 +97,40 @@ class ProposalConfig:
     """Keep only the k proposals of a state with the highest Q before weighting (4.3); None keeps all."""
     proxy_std_floor: float = 0.1
     """Smallest standard deviation of the Gaussian proxy (Eq. 10), in scaled actions."""
+    keep_diverse: int | None = None
+    """Of a state's proposals keep this many that lie farthest apart, before weighting (5.6: diversity-aware sampling,
+    for a larger K); None keeps all."""
+    guidance_gate: bool = False
+    """Multiply beta and alpha by the rank correlation of Q - V with the advantages of fresh rows, from 0 (Q ranks no
+    better than chance) to 1 (5.6: gating)."""
+    q_pessimism: float = 0.0
+    """Standard deviations between Q's heads by which proposals see Q lower (needs q_heads of 2 or more)."""
+    mode_seeking: float = 0.0
+    """kappa: energy weights become exp(beta Q + kappa log pi(a|s)), so that proposals near the mode that the policy is
+    in count more; 0 is Eq. 7."""
+    prior_return: Literal["none", "top"] = "none"
+    """What a prior that was fitted with condition_on 'return' is asked for: nothing, or the logs' best returns."""
+    prior_return_weight: float = 1.0
+    """Classifier-free guidance: how far beyond the unconditioned prior the diffusion prior goes towards what it is
+    asked for; 1 is the conditioned prior itself, other numbers cost twice the sampling."""
 
 
 @dataclass(frozen=True)
 class ObjectiveConfig:
-    """Weights of the actor objective (Eq. 9)."""
+    """Weights of what is added to PPO's objective (Eq. 9)."""
 
     lambda_kl: float = 5e-3
     """Weight of KL(pi || proxy) (Table 2)."""
     lambda_aux: float = 1e-2
     """Weight of the imitation of proposals (Table 2)."""
     lambda_decay: float | None = None
-    """Fraction of the run at which both weights have decayed linearly to 0; None keeps them constant."""
+    """Fraction of the run at which all these weights have decayed linearly to 0; None keeps them constant."""
+    lambda_awr: float = 0.0
+    """Weight of advantage-weighted imitation of the policy's own fresh actions (PPO + AWR/AWAC-aux)."""
+    awr_temperature: float = 1.0
+    """tau: weights are exp(standardised advantage / tau)."""
+    awr_weight_cap: float = 20.0
+    """Largest weight of a row."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +146,12 @@ class QConfig:
     """Adam's rate for Q."""
     q_epochs: int = 2
     """Passes over D_on a Q update makes in each iteration."""
+    q_target: Literal["td", "gae", "advantage"] = "td"
+    """What Q is regressed on: r + gamma V(s') (4.4), GAE's returns, or GAE's advantages (5.7: advantage-energy)."""
+    q_heads: int = 1
+    """Heads of Q, which differ by their start; 2 are twin heads."""
+    q_calibration: Literal["none", "affine", "isotonic"] = "none"
+    """Map Q, before it guides, to the returns that followed it on the last rollout (5.6); the host waits for Q then."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +181,10 @@ class WarmStartConfig:
     """Most passes over the logs; early stopping on held-out episodes ends it sooner."""
     warm_start_std_floor: float = 0.2
     """Smallest standard deviation of the cloned policy, in scaled actions, so that PPO can still explore."""
+    q_warm_start: bool = False
+    """With `warm_start = actor`, start Q as well, by regression on logged returns-to-go; `actor_critic` always does."""
+    logs_filter: float = 1.0
+    """Share of the logs' rows that a warm start sees: whole episodes, those of the highest return first."""
 
 
 @dataclass(frozen=True)
@@ -229,18 +273,23 @@ _RULES: dict[str, Rule] = {
          "q_hidden_size", "q_epochs", "pet_minibatch_size", "adapter_rank", "warm_start_epochs", "steps",
          "eval_episodes", "checkpoint_every", "threads", "learning_rate", "max_grad_norm", "kl_target",
          "observation_clip", "reward_clip", "guidance_cap", "proxy_std_floor", "q_learning_rate", "pet_learning_rate",
-         "warm_start_std_floor", "clip_epsilon"),
+         "warm_start_std_floor", "clip_epsilon", "q_heads", "awr_temperature", "awr_weight_cap"),
         POSITIVE,
     ),
     **dict.fromkeys(
-        ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every",
-),
+        ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "lambda_awr", "pet_frequency",
+         "eval_every", "q_pessimism", "mode_seeking", "prior_return_weight", "contest_kl_weight"),
         AT_LEAST_0,
     ),
     "seed": (lambda v: 0 <= v < 2**32, "a number from 0 to 4294967295"),
-    **dict.fromkeys(["proposal_fraction", "beta_anneal"], SHARE),
+    **dict.fromkeys(["proposal_fraction", "beta_anneal", "logs_filter"], SHARE),
     **dict.fromkeys(("gamma", "gae_lambda"), (lambda v: 0 <= v <= 1, "a number from 0 to 1")),
-    **dict.fromkeys(("displacement_cap", "top_k"), (lambda v: v is None or v > 0, "a number above 0, or None")),
+    "clip_slope": (lambda v: -1 <= v <= 1, "a number from -1 to 1"),
+    "reuse_batches": (lambda v: 0 <= v <= 1, "a number from 0 to 1"),
+    **dict.fromkeys(
+        ("displacement_cap", "top_k", "keep_diverse", "boundary_kl"),
+        (lambda v: v is None or v > 0, "a number above 0, or None"),
+    ),
     "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),
 }
 # fmt: on
@@ -255,10 +304,18 @@ def validate(config: Config) -> None:
         raise InputError(f"rollout_steps {ppo.rollout_steps} must be a multiple of num_envs {ppo.num_envs}")
     if ppo.rollout_steps % ppo.minibatch_size:
         raise InputError(f"rollout_steps {ppo.rollout_steps} must be a multiple of minibatch_size {ppo.minibatch_size}")
-    if config.proposals.top_k is not None and config.proposals.top_k > config.proposals.num_proposals:
-        raise InputError(
-            f"top_k {config.proposals.top_k} must be at most num_proposals {config.proposals.num_proposals}"
-        )
+    proposals = config.proposals
+    most = proposals.num_proposals
+    for name in ("keep_diverse", "top_k"):
+        value = getattr(proposals, name)
+        if value is not None and value > most:
+            what = "keep_diverse" if most != proposals.num_proposals else "num_proposals"
+            raise InputError(f"{name} {value} must be at most {what} {most}")
+        most = value or most
+    if config.warm.q_warm_start and config.warm.warm_start == "none":
+        raise InputError("q_warm_start needs a warm_start: 'actor', or 'actor_critic', which starts Q as well")
+    if proposals.q_pessimism and config.q.q_heads < 2:
+        raise InputError(f"q_pessimism {proposals.q_pessimism} needs q_heads of 2 or more, not {config.q.q_heads}")
 
 
 _FLOATS = frozenset(

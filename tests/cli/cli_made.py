@@ -57,8 +57,9 @@ def write_logs(folder):
 def write_priors(folder):
     import jax.numpy as jnp
 
-    from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-    from ppo_dap.priors.prior import DiffusionPrior
+    from ppo_dap.prior_config import DiffusionConfig
+    from ppo_dap.priors.diffusion import Denoiser
+    from ppo_dap.priors.prior import Prior
 
     config = DiffusionConfig(width=4)
 
@@ -67,7 +68,7 @@ def write_priors(folder):
         high = np.full(action_size, high, np.float32)
         probe = np.zeros((2, observation_size), np.float32), np.zeros((2, action_size), np.float32)
         denoiser = Denoiser.create(np.random.default_rng(0), config, *moments, action_size)
-        DiffusionPrior(denoiser, config, -high, high, task, "hash", {}, *probe).save(folder / name)
+        Prior(denoiser, -high, high, task, "hash", {}, *probe).save(folder / name)
 
     save("prior", TASK)
     save("prior-wide", "Hopper-v5", observation_size=11, action_size=3)

@@ -11,11 +11,12 @@ from scipy.stats import norm
 from ppo_dap.config import make
 from ppo_dap.dap.audit import Probe
 from ppo_dap.dap.objective import Weights
-from ppo_dap.nets.critic import QFunction
+from ppo_dap.nets.critic import QFunction, QHead
 from ppo_dap.nets.mlp import Linear
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import Normaliser, Settings
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
+from ppo_dap.prior_config import DiffusionConfig
+from ppo_dap.priors.diffusion import Denoiser
 from ppo_dap.training import algorithm
 from ppo_dap.training.algorithm import Frozen, Schedule, Stages, create_learner
 from ppo_dap.training.draws import draw, num_parts
@@ -52,7 +53,7 @@ def small_denoiser():
 def small_frozen():
     rng = np.random.default_rng(6)
     rows = rng.standard_normal((16, OBS)), rng.uniform(-1, 1, (16, ACT))
-    return Frozen(small_denoiser(), Probe(*(jnp.asarray(r, jnp.float32) for r in rows)))
+    return Frozen(small_denoiser(), jnp.zeros(0), Probe(*(jnp.asarray(r, jnp.float32) for r in rows)))
 
 
 def learner_of(config, guided=True):
@@ -92,14 +93,14 @@ def parts_of(rollout, config):
 
 def iterated(iterate, learner, frozen, rollout, schedule, stages, config, iteration=0):
     """One iteration of `iterate` on a rollout as above, with the random numbers that a run would draw for it."""
-    draws = draw(config, iteration, ACT, learner.guide is not None)
+    draws = draw(config, iteration, None if frozen is None else frozen.prior)
     parts = parts_of(rollout, config)
     return iterate(learner, frozen, parts, NORMALISER, lambda: REWARD_STD, schedule, draws, stages)
 
 
 def schedule_of(iteration=0, lambda_kl=0.05, lambda_aux=0.1, guided=True, pet_steps=2):
     numbers = [jnp.asarray(x, jnp.float32) for x in (3e-3, jnp.inf, lambda_kl, lambda_aux, 0.7)]
-    weights = Weights(*numbers[2:4]) if guided else ()
+    weights = Weights(*numbers[2:4], jnp.zeros(())) if guided else ()
     settings = Settings(*numbers[:2], jnp.asarray(guided), weights)
     return Schedule(jnp.asarray(iteration * ROWS, jnp.int32), settings, numbers[4], jnp.asarray(pet_steps, jnp.int32))
 
@@ -133,12 +134,12 @@ def changed(node, **values):
 
 def slope_q(slope, width=8, scale=1.0):
     """Q(s, a) = scale * tanh(slope . a), whatever the state's features are."""
-    return QFunction(
-        None,
+    head = QHead(
         Linear(jnp.zeros((1, width)), jnp.zeros(1)),
         Linear(jnp.asarray([slope], jnp.float32), jnp.zeros(1)),
         Linear(jnp.asarray([[scale]], jnp.float32), jnp.zeros(1)),
     )
+    return QFunction(None, (head,))
 
 
 def bits(tree):
@@ -152,9 +153,9 @@ def quick_jit(function, **options):
 
 def quick_stages(config):
     """The stages of a run; those in which no bit is compared are compiled quickly."""
-    stages = Stages(config, DIFFUSION)
+    stages = Stages(config, guided=True)
     for name, stage in vars(stages).items():
-        if name not in ("actor", "critic"):
+        if name not in ("actor", "critic", "seeks_mode"):
             setattr(stages, name, quick_jit(stage.__wrapped__))
     return stages
 

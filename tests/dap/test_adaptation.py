@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dap.dap_made import ACT, DIFFUSION, OBS, bits, quick_jit, small_denoiser
+from dap.dap_made import ACT, OBS, bits, quick_jit, small_denoiser
 from ppo_dap.config import AdaptationConfig
 from ppo_dap.dap.adaptation import ADAM, PETData, PETDraws, adapt, steps_until
 from ppo_dap.dap.objective import Batch, provenance
@@ -37,15 +37,11 @@ def pet(states):
     """
     batch = Batch(jnp.asarray(64, jnp.int32), jnp.asarray(states), jnp.asarray(WEIGHTS, jnp.float32))
     config = AdaptationConfig(pet_minibatch_size=16, pet_learning_rate=1e-3)
-    run = quick_jit(
-        partial(
-            adapt, diffusion=DIFFUSION, config=config, check=lambda ids, seen: provenance(ids, seen, batch)
-        )
-    )  # fmt: skip
+    run = quick_jit(partial(adapt, config=config, check=lambda ids, seen: provenance(ids, seen, batch)))
 
     def adapted(rows, steps, kind="lora", changed=None):
         start = init_adapters(np.random.default_rng(1), small_denoiser(), kind, 2)
-        draws = PETDraws.make(np.random.default_rng(2), ACT, 400, config)  # 40 steps
+        draws = PETDraws.make(np.random.default_rng(2), small_denoiser(), 400, config)  # 40 steps
         if changed is not None:
             draws = jax.tree.map(lambda x: np.concatenate([x[:changed], 1 - x[changed:]]), draws)
         return start, run(small_denoiser(), start, ADAM.init(start), rows, draws, jnp.asarray(steps, jnp.int32))
@@ -120,7 +116,7 @@ def test_fractions_of_a_step_are_not_lost(frequency, updates):
 def test_every_step_has_draws_of_its_own(frequency, updates):
     most = max(np.diff([steps_until(i, frequency, updates) for i in range(101)]))
     config = AdaptationConfig(pet_frequency=frequency, pet_minibatch_size=4)
-    draws = PETDraws.make(np.random.default_rng(0), ACT, updates, config)
+    draws = PETDraws.make(np.random.default_rng(0), small_denoiser(), updates, config)
     steps, *rest = draws.rows.shape
     assert steps >= most
     assert [x.shape for x in jax.tree.leaves(draws)] == [(steps, 4), (steps, 4), (steps, 4, ACT)]

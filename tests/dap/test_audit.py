@@ -133,12 +133,12 @@ def test_logged_rows_in_pet_are_found(learner, frozen, stages):
 def test_spr_is_1_when_every_state_gets_proposals(frozen):
     everything = small_config(proposal_fraction=1.0)
     learner, stages = learner_of(everything), quick_stages(everything)
-    rollout, draws = rollout_of(learner.ppo.actor), draw(everything, 0, ACT, True)
+    rollout, draws = rollout_of(learner.ppo.actor), draw(everything, 0, frozen.prior)
     assert not rollout.valid.all()
     parts, critic = parts_of(rollout, everything), learner.ppo.critic
     rows, batch, _ = stages.advantages(critic, parts, NORMALISER, REWARD_STD, jnp.int32(0))
     assert len(rows.weights) == ROWS
-    proposer = learner.guide.proposer(frozen.denoiser, critic)
+    proposer = learner.guide.proposer(frozen.prior, frozen.condition, critic, None)
     proposed = [
         stages.propose(proposer, x.state_ids, x.observations, x.valid, NORMALISER, jnp.float32(1), numbers)
         for x, numbers in zip(parts, draws.proposals, strict=True)

@@ -94,7 +94,9 @@ def test_drift_is_alpha_times_the_finite_difference_gradient_of_q(own_trunk):
     q = filled(lambda rng: QFunction.create(rng, 3, 2, 4, 8, own_trunk), 0)
     features, x = NOISE[:, 0, :4], NOISE[..., 4:]
     config = ProposalConfig(guidance_cap=100.0)
-    drift = np.asarray(quick_jit(lambda x: q_drift(q, features, 5.0, config)(x, jnp.float32(2.0)))(x))
+    drift = np.asarray(
+        quick_jit(lambda x: q_drift(lambda actions: q(features, actions), 5.0, config)(x, jnp.float32(2.0)))(x)
+    )
     value = quick_jit(lambda x: q(features, x))
     step = 1e-2
     for d in range(2):
@@ -108,7 +110,8 @@ def test_drift_is_alpha_times_the_finite_difference_gradient_of_q(own_trunk):
 def test_cap_bounds_what_it_says(cap_on, longest):
     """Q's slope is 5 and more: with the cap on the step it has norm c, with the cap on the gradient alpha_t c."""
     config = ProposalConfig(cap_on=cap_on)
-    drift = q_drift(slope_q([3.0, -4.0], scale=2.0), jnp.zeros((5, 8)), 5.0, config)
+    q, features = slope_q([3.0, -4.0], scale=2.0), jnp.zeros((5, 8))
+    drift = q_drift(lambda actions: q(features, actions), 5.0, config)
     x = 0.01 * NOISE[..., :2]
     pushes = np.asarray(drift(x, jnp.float32(2.0)))
     np.testing.assert_allclose(np.linalg.norm(pushes, axis=-1), longest, rtol=1e-4)

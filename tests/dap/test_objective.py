@@ -1,5 +1,7 @@
 """Eq. 9's last two terms against Monte Carlo and finite differences, and the gate in front of them by hand."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,14 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import norm
 
 from dap.dap_made import bits, changed, filled
+from ppo_dap.config import ObjectiveConfig
 from ppo_dap.dap.objective import (
     Batch,
     GatedProposals,
     Weights,
+    added_gradient,
     admit,
     admit_proposals,
-    proposal_gradient,
     proposal_terms,
     provenance,
 )
@@ -23,6 +26,8 @@ from ppo_dap.nets.actor import Actor
 from ppo_dap.ppo.update import Rows
 
 N, K = 5, 4
+_WIDE, _FLAT = jnp.zeros((N, 3)), jnp.zeros(N)
+ROWS = Rows(jnp.arange(N), _WIDE, _WIDE, jnp.zeros((N, 2)), _FLAT, jnp.zeros((N, 2)), _FLAT, _FLAT, _FLAT, _FLAT)
 
 
 def numbers(*shape, seed=0):
@@ -39,7 +44,7 @@ def gated_of(gate=(1, 1, 1, 1, 1), dtype=jnp.float32):
 
 
 def weights_of(kl, aux, dtype=jnp.float32):
-    return Weights(jnp.asarray(kl, dtype), jnp.asarray(aux, dtype))
+    return Weights(jnp.asarray(kl, dtype), jnp.asarray(aux, dtype), jnp.zeros((), dtype))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +52,12 @@ def actor():
     return filled(lambda rng: Actor.create(rng, 3, 2, 4), 7)
 
 
-terms, gradient_of = jax.jit(proposal_terms), jax.jit(proposal_gradient)
+terms = jax.jit(proposal_terms)
+_added = jax.jit(partial(added_gradient, config=ObjectiveConfig()))
+
+
+def gradient_of(actor, gated, weights):
+    return _added(actor, ROWS, gated, weights)
 
 
 def test_value_by_monte_carlo_and_scipy(actor):

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import pytest
 
 from dap.dap_made import (
-    DIFFUSION,
     changed,
     learner_of,
     logged,
@@ -83,7 +82,7 @@ STATIC_FAULTS = {
     "V's targets that proposals changed": (tamper("critic", returns_of_proposals), {V}),
     "logged rows in V's loss": (tamper("critic", logged_rows_for(2)), {V, REST}),
     "logged rows in PET": (tamper("adapt", logged_rows_for(2)), {PET, REST}),
-    "logged rows in Q's loss": (tamper("learn_q", logged_rows_for(2)), {REST}),
+    "logged rows in Q's loss": (tamper("learn_q", logged_rows_for(3)), {REST}),
     "logs in the optimizer's moments": (offline_moments_in_the_optimizer, {REST}),
 }
 
@@ -91,7 +90,7 @@ STATIC_FAULTS = {
 @pytest.fixture(scope="module")
 def traceable(config):
     """The stages as a run has them; they are traced and never compiled."""
-    return Stages(config, DIFFUSION)
+    return Stages(config, guided=True)
 
 
 def proved(learner, frozen, config, stages, fault=None):
@@ -113,7 +112,7 @@ def test_every_static_claim_holds_without_a_fault(learner, frozen, config, trace
 
 
 def test_plain_ppo_is_proved_too(config):
-    claims = proof.prove(learner_of(config, guided=False), None, config, Stages(config, None))
+    claims = proof.prove(learner_of(config, guided=False), None, config, Stages(config, guided=False))
     assert {claim.statement for claim in claims} == {RATIO, ADVANTAGES, V, POLICY, REST}
     assert violated(claims) == set()
 
@@ -135,7 +134,7 @@ def test_evidence_names_what_arrived(learner, frozen, config, traceable):
 
 def test_qs_gradient_in_vs_trunk_is_found(frozen):
     shared = small_config(q_trunk="shared")
-    assert violated(proved(learner_of(shared), frozen, shared, Stages(shared, DIFFUSION))) == {V}
+    assert violated(proved(learner_of(shared), frozen, shared, Stages(shared, guided=True))) == {V}
 
 
 def actor_gradient_into_the_prior(name, stage, arguments, seen, frozen):
@@ -146,7 +145,7 @@ def actor_gradient_into_the_prior(name, stage, arguments, seen, frozen):
     (proposer, *inputs), _ = seen["propose"]
     (state, _, batch), _ = seen["gate"]
     _, (actor, _, _) = seen["actor"]
-    weights = objective.Weights(jnp.float32(1), jnp.float32(1))
+    weights = objective.Weights(*(jnp.float32(1),) * 3)
 
     def actor_loss(adapters):
         proposed = seen["stages"].propose(proposer._replace(adapters=adapters), *inputs)
@@ -162,7 +161,7 @@ def test_an_unblocked_gradient_into_the_prior_is_found(learner, frozen, config, 
     # Blocked: the gradient is nothing at all.
     assert violated(proved(learner, frozen, config, traceable, fault)) == set()
     monkeypatch.setattr(jax.lax, "stop_gradient", lambda x: x)
-    claims = proved(learner, frozen, config, Stages(config, DIFFUSION), fault)
+    claims = proved(learner, frozen, config, Stages(config, guided=True), fault)
     assert violated(claims) == {PET}
     (evidence,) = [claim.evidence for claim in claims if claim.statement == PET]
     assert {"actor", "q", "proposals"} <= {*evidence.removeprefix("reached by ").split(", ")}

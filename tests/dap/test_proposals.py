@@ -1,18 +1,20 @@
 """D_syn: what is resampled, what is carried along, what is logged, and what guidance does to it."""
 
 import itertools
+from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from dap.dap_made import DIFFUSION, OBS, bits, quick_jit, slope_q, small_denoiser
+from dap.dap_made import OBS, bits, quick_jit, slope_q, small_denoiser
 from ppo_dap.config import ProposalConfig
-from ppo_dap.dap import proposals as module
 from ppo_dap.dap.proposals import (
     ProposalDraws,
+    Proposer,
     States,
     acceptance,
     choose_states,
@@ -28,9 +30,7 @@ Q = slope_q(SLOPE)
 
 
 N = 256
-_SETTINGS = ("diffusion", "config")
-_propose = quick_jit(propose, static_argnames=_SETTINGS)
-_resample = quick_jit(lambda *args, **settings: propose(*args, **settings), static_argnames=_SETTINGS)
+_propose = quick_jit(propose, static_argnames="config")
 
 
 def states(raw):
@@ -39,29 +39,62 @@ def states(raw):
     return States(*(jnp.asarray(x) for x in (ids, np.float32(raw), np.float32(seen), np.zeros((len(raw), 8), "f4"))))
 
 
-def run(function, given, seed=0, beta=1.0, spread=1.0, adapters=None, q=Q, **options):
+def proposer(prior, adapters=None, q=Q, spread=1.0, rank=0.0, calibration=None, actor=None):
+    return Proposer(prior, jnp.zeros(0), adapters, q, jnp.float32(spread), jnp.float32(rank), calibration, None, actor)
+
+
+def run(given, prior=None, seed=0, beta=1.0, **options):
+    of_proposer = {name: options.pop(name) for name in Proposer._fields if name in options}
+    of_proposer |= {name: options.pop(name) for name in ("spread", "rank") if name in options}
     config = ProposalConfig(**{"num_proposals": 4, "sampler_steps": 4, **options})
+    prior = prior or small_denoiser()
     count = len(given.state_ids)
-    draws = ProposalDraws.make(np.random.default_rng(seed), count, count, len(SLOPE), config)
-    numbers = draws, jnp.float32(beta), jnp.float32(spread)
-    return function(small_denoiser(), adapters, q, given, *numbers, diffusion=DIFFUSION, config=config)
+    draws = ProposalDraws.make(np.random.default_rng(seed), count, count, prior, config)
+    return _propose(proposer(prior, **of_proposer), given, draws, jnp.float32(beta), config=config)
 
 
 def made(**options):
     """Proposals of the prior on N states."""
-    return run(_propose, states(np.random.default_rng(4).standard_normal((N, OBS))), **options)
+    return run(states(np.random.default_rng(4).standard_normal((N, OBS))), **options)
+
+
+@dataclass(frozen=True)
+class PlantedSettings:
+    num_conditions: int = 0
+    sigma_max: float = 5.0
+
+
+SETTINGS = PlantedSettings()
+
+
+class Planted(eqx.Module):
+    """A prior whose actions at a state are that state's numbers."""
+
+    count: int = eqx.field(static=True)
+    config: PlantedSettings = eqx.field(static=True)
+
+    @staticmethod
+    def create(rng, config, observation_mean, observation_std, action_spread, action_size):
+        raise NotImplementedError
+
+    def noise_shape(self, solver, states, num):
+        return (states, num, 2)
+
+    def sample(self, observations, condition, noise, solver, adapters=None, drift=None, displacement_cap=None):
+        return observations.reshape(-1, self.count, 2), jnp.zeros((observations.shape[0], self.count))
+
+    def draw_loss(self, rng, *shape):
+        raise NotImplementedError
+
+    def loss(self, observations, condition, actions, draws, adapters=None):
+        raise NotImplementedError
 
 
 def resampled(candidates, **options):
     """D_syn from `candidates` (n, 4, 2) in place of the prior's samples: they come in as what the prior reads."""
 
-    def samples(denoiser, adapters, raw, condition, noise, *_, **__):
-        shape = noise.shape[1:]
-        return raw.reshape(shape), jnp.zeros(shape[:2])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "sample_actions", samples)
-        return run(_resample, states(candidates.reshape(len(candidates), -1)), **options)
+    planted = candidates.reshape(len(candidates), -1)
+    return run(states(planted), Planted(candidates.shape[1], SETTINGS), **options)
 
 
 def chosen_of(actions, planted):
@@ -218,12 +251,11 @@ def test_no_gradient_of_a_proposal_reaches_the_prior(monkeypatch):
     adapters = jax.tree.map(lambda x: x + 0.1, init_adapters(np.random.default_rng(1), small_denoiser(), "lora", 2))
     given = states(np.ones((4, OBS)))
     config = ProposalConfig(num_proposals=3, sampler_steps=2, q_scale="none")
-    draws = jax.tree.map(jnp.asarray, ProposalDraws.make(np.random.default_rng(0), 4, 4, len(SLOPE), config))
+    draws = jax.tree.map(jnp.asarray, ProposalDraws.make(np.random.default_rng(0), 4, 4, small_denoiser(), config))
 
     def gradients():
         def total(prior):
-            numbers = draws, jnp.float32(1), jnp.float32(1)
-            proposals, metrics = propose(*prior, Q, given, *numbers, diffusion=DIFFUSION, config=config)
+            proposals, metrics = propose(proposer(*prior), given, draws, jnp.float32(1), config=config)
             return jnp.sum(proposals.actions**3 + proposals.proxy_std[:, None]) + metrics["ess"]
 
         return [np.any([np.any(x) for x in jax.tree.leaves(part)]) for part in quick_jit(jax.grad(total))(prior)]

@@ -28,7 +28,7 @@ def trained(config, frozen, stages, guided, **weights):
 def ppo(config, stages):
     """Without a guide; the actor's stage is compiled without the added gradient."""
     plain = copy.copy(stages)
-    plain.actor = Stages(config, None).actor
+    plain.actor = Stages(config, guided=False).actor
     return trained(config, None, plain, guided=False)[0]
 
 

@@ -7,7 +7,8 @@ import pytest
 from ppo_dap.errors import InputError
 from ppo_dap.nets.adapters import Adapters, LoRA, adapter_norm, init_adapters, merge
 from ppo_dap.nets.mlp import MLP
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, LossDraws, denoising_loss
+from ppo_dap.prior_config import DiffusionConfig
+from ppo_dap.priors.diffusion import Denoiser, LossDraws, denoising_loss
 
 CONFIG = DiffusionConfig(width=32, depth=2)
 KINDS = ["lora", "bottleneck"]

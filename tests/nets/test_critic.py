@@ -34,7 +34,8 @@ def test_qs_gradient_reaches_vs_trunk_only_when_shared(own_trunk, shared, reache
     in_critic, in_q = gradients(create_q(own_trunk), shared)
     assert moves(in_critic.trunk) == reaches
     assert not moves(in_critic.v_head)
-    assert all(moves(layer) for layer in (in_q.state, in_q.action, in_q.out))
+    (head,) = in_q.heads
+    assert all(moves(layer) for layer in (head.state, head.action, head.out))
     assert moves(in_q.trunk) == own_trunk
 
 
@@ -59,6 +60,7 @@ def numpy_linear(layer, x):
 def test_values_and_q_equal_plain_numpy_row_by_row():
     q = jax.tree.map(lambda leaf: leaf + 0.1, create_q())
     critic = jax.tree.map(lambda leaf: leaf + 0.1, CRITIC)
+    (head,) = q.heads
     values, q_values = critic(OBSERVATIONS), q(critic.features(OBSERVATIONS), ACTIONS)
     assert values.shape == (6,)
     assert q_values.shape == (6, 4)
@@ -68,5 +70,6 @@ def test_values_and_q_equal_plain_numpy_row_by_row():
             hidden = np.tanh(numpy_linear(layer, hidden))
         assert float(values[i]) == pytest.approx(numpy_linear(critic.v_head, hidden)[0], abs=1e-5)
         for k in range(4):
-            both = np.tanh(numpy_linear(q.state, hidden) + numpy_linear(q.action, np.asarray(ACTIONS)[i, k]))
-            assert float(q_values[i, k]) == pytest.approx(numpy_linear(q.out, both)[0], abs=1e-5)
+            action = numpy_linear(head.action, np.asarray(ACTIONS)[i, k])
+            both = np.tanh(numpy_linear(head.state, hidden) + action)
+            assert float(q_values[i, k]) == pytest.approx(numpy_linear(head.out, both)[0], abs=1e-5)

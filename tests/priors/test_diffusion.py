@@ -197,7 +197,7 @@ def test_settings_of_the_wrong_type_are_refused():
     """In a process of its own, since the tests' type checker would speak first."""
     code = """
 from ppo_dap.errors import InputError
-from ppo_dap.priors.diffusion import DiffusionConfig
+from ppo_dap.prior_config import DiffusionConfig
 for options in ({"noise_distribution": "log-normal"}, {"width": "64"}, {"depth": 1.5}, {"rho": True}):
     try:
         DiffusionConfig(**options)

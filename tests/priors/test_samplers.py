@@ -7,7 +7,8 @@ import pytest
 from truths import TwoModes, energy, moment_matched, two_sample_p
 
 from ppo_dap.errors import InputError
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, sample_actions
+from ppo_dap.prior_config import DiffusionConfig
+from ppo_dap.priors.diffusion import Denoiser, sample_actions
 from ppo_dap.priors.samplers import SAMPLERS, Solver, ancestral, centred_start, dpmpp_2m, karras_sigmas
 
 STATE = np.array([[0.3, -0.6]])

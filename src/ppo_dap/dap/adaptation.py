@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import AdaptationConfig
 from ppo_dap.nets.adapters import Adapters
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig, LossDraws, denoising_loss
+from ppo_dap.priors.network import Network
 
 Provenance = Callable[[Int[Array, " n"], Float[Array, "n obs"]], Float[Array, " n"]]
 """(state_ids, raw states) -> 1 for each that is a row of D_on, else 0."""
@@ -37,14 +37,15 @@ class PETDraws(NamedTuple):
 
     rows: Float[Array, "steps batch"]
     """Uniform; which rows each step sees."""
-    loss: LossDraws
+    loss: Any
+    """As the prior draws them."""
 
     @staticmethod
-    def make(rng: np.random.Generator, action_size: int, actor_updates: int, config: AdaptationConfig):
+    def make(rng: np.random.Generator, prior: Network, actor_updates: int, config: AdaptationConfig):
         """Draws for an iteration of `actor_updates`."""
         most = max(1, -(-config.pet_frequency * actor_updates // 100))  # a loop of no steps is traced all the same
         size = (most, config.pet_minibatch_size)
-        return PETDraws(rng.random(size, dtype=np.float32), LossDraws.make(rng, *size, action_size))  # type: ignore[arg-type]
+        return PETDraws(rng.random(size, dtype=np.float32), prior.draw_loss(rng, *size))  # type: ignore[arg-type]
 
 
 def steps_until(iteration: int, pet_frequency: int, actor_updates: int) -> int:
@@ -53,14 +54,13 @@ def steps_until(iteration: int, pet_frequency: int, actor_updates: int) -> int:
 
 
 def adapt(
-    denoiser: Denoiser,
+    prior: Network,
     adapters: Adapters,
     optimizer: optax.OptState,
     rows: PETData,
     draws: PETDraws,
     num_steps: Int[Array, ""],
     *,
-    diffusion: DiffusionConfig,
     config: AdaptationConfig,
     check: Provenance,
 ) -> tuple[Adapters, optax.OptState, dict[str, Float[Array, ""]]]:
@@ -68,7 +68,8 @@ def adapt(
 
     Every minibatch goes through `check`; the metric `pet_spr` is the smallest share of a minibatch that passed.
     """
-    condition = jnp.zeros((config.pet_minibatch_size, diffusion.num_conditions))
+    # On fresh rows nothing is known of the episode's return.
+    condition = jnp.zeros((config.pet_minibatch_size, prior.config.num_conditions))
     # Rows without weight (no transition happened) come last and are never drawn.
     order = jnp.argsort(-rows.weights, stable=True)
     num_valid = jnp.sum(rows.weights)
@@ -79,7 +80,7 @@ def adapt(
         index = order[jnp.floor(uniform * num_valid).astype(jnp.int32)]
         batch = jax.tree.map(lambda x: x[index], rows)
         loss, gradient = jax.value_and_grad(
-            lambda a: denoising_loss(denoiser, a, batch.observations, condition, batch.actions, noise, diffusion)
+            lambda a: prior.loss(batch.observations, condition, batch.actions, noise, a)
         )(adapters)
         updates, optimizer = ADAM.update(gradient, optimizer)
         adapters = jax.tree.map(lambda p, u: p - config.pet_learning_rate * u, adapters, updates)

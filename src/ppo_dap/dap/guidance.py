@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 
 def beta_schedule(progress: float, beta_max: float, anneal: float) -> float:
@@ -14,13 +14,21 @@ def beta_schedule(progress: float, beta_max: float, anneal: float) -> float:
 
 
 def energy_weights(
-    q: Float[Array, "n k"], beta: Float[Array, ""], scale: Float[Array, ""], kept: Bool[Array, "n k"]
+    q: Float[Array, "n k"],
+    beta: Float[Array, ""],
+    scale: Float[Array, ""],
+    kept: Bool[Array, "n k"],
+    log_density: Float[Array, "n k"] | None = None,
 ) -> Float[Array, "n k"]:
     """Eq. 7: w_i proportional to exp(beta Q(s, a_i)) over the `kept` proposals, summing to 1 in each state.
 
     `scale` divides Q: one number for all states, so that a state in which all actions are alike keeps even weights.
+    `log_density` is added to the exponent: kappa log pi(a_i | s), for weights that seek the policy's own mode.
     """
-    energy = jnp.where(kept, beta * q / scale, -jnp.inf)
+    energy = beta * q / scale
+    if log_density is not None:
+        energy = energy + log_density
+    energy = jnp.where(kept, energy, -jnp.inf)
     # The state's largest energy, not its mean, is taken off: the same weights, and no overflow.
     weights = jnp.exp(energy - jnp.max(energy, axis=1, keepdims=True))
     return weights / jnp.sum(weights, axis=1, keepdims=True)
@@ -37,6 +45,19 @@ def top_k_mask(q: Float[Array, "n k"], top_k: int | None) -> Bool[Array, "n k"]:
         return jnp.ones(q.shape, bool)
     ranks = jnp.argsort(jnp.argsort(-q, axis=1, stable=True), axis=1, stable=True)
     return ranks < top_k
+
+
+def farthest(actions: Float[Array, "n k act"], num: int) -> Int[Array, "n num"]:
+    """Indices of `num` actions of each state that lie far apart: the first, then each time the one whose nearest chosen
+    one is farthest (Gonzalez, 1985).
+    """
+    distances = jnp.sum(jnp.square(actions[:, :, None, :] - actions[:, None, :, :]), axis=-1)
+    chosen, nearest = [jnp.zeros(actions.shape[0], jnp.int32)], distances[:, 0]
+    for _ in range(num - 1):
+        chosen.append(jnp.argmax(nearest, axis=1).astype(jnp.int32))
+        to_last = jnp.take_along_axis(distances, chosen[-1][:, None, None], axis=1)[:, 0]
+        nearest = jnp.minimum(nearest, to_last)
+    return jnp.stack(chosen, axis=1)
 
 
 def effective_sample_size(weights: Float[Array, "n k"]) -> Float[Array, " n"]:

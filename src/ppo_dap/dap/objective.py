@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ppo_dap.config import ObjectiveConfig
 from ppo_dap.dap.proposals import Proposals
 from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob
-from ppo_dap.ppo.surrogate import weighted_mean
+from ppo_dap.ppo.surrogate import normalise, weighted_mean
 from ppo_dap.ppo.update import Rows
 
 
@@ -20,6 +22,7 @@ class Weights(NamedTuple):
 
     lambda_kl: Float[Array, ""]
     lambda_aux: Float[Array, ""]
+    lambda_awr: Float[Array, ""]
 
 
 class GatedProposals(eqx.Module):
@@ -79,9 +82,33 @@ def proposal_terms(
     return loss, {"kl_loss": kl_loss, "aux_loss": aux_loss}
 
 
-def proposal_gradient(
-    actor: Actor, gated: GatedProposals, weights: Weights
+def advantage_weighted_loss(actor: Actor, rows: Rows, temperature: float, weight_cap: float) -> Float[Array, ""]:
+    """PPO + AWR/AWAC-aux (Table 3): E[-min(exp(A / tau), cap) log pi(a | s)] on the policy's own rows.
+
+    Advantages are standardised over the rows, as in AWR (Peng et al., 2019).
+    """
+    standardised = normalise(rows.advantages, rows.weights)
+    importance = jax.lax.stop_gradient(jnp.minimum(jnp.exp(standardised / temperature), weight_cap))
+    means = actor(rows.observations)
+    actions = jnp.where(rows.weights[:, None] > 0, rows.actions, jax.lax.stop_gradient(means))
+    return -weighted_mean(importance * log_prob(actions, means, actor.log_std), rows.weights)
+
+
+def added_terms(
+    actor: Actor, rows: Rows, gated: GatedProposals | tuple[()], weights: Weights, *, config: ObjectiveConfig
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """All that a method adds to PPO's objective, to be minimised; without proposals (`()`) their terms are left out."""
+    loss, metrics = jnp.zeros(()), {}
+    if not isinstance(gated, tuple):
+        loss, metrics = proposal_terms(actor, gated, weights)
+    if config.lambda_awr > 0:
+        metrics["awr_loss"] = advantage_weighted_loss(actor, rows, config.awr_temperature, config.awr_weight_cap)
+        loss = loss + weights.lambda_awr * metrics["awr_loss"]
+    return loss, metrics
+
+
+def added_gradient(
+    actor: Actor, rows: Rows, gated: GatedProposals | tuple[()], weights: Weights, *, config: ObjectiveConfig
 ) -> tuple[Actor, dict[str, Float[Array, ""]]]:
-    """Gradient of `proposal_terms` in the actor's parameters: what is added to PPO's."""
-    gradient, metrics = jax.grad(proposal_terms, has_aux=True)(actor, gated, weights)
-    return gradient, metrics
+    """Gradient of `added_terms` in the actor's parameters: what is added to PPO's."""
+    return jax.grad(partial(added_terms, config=config), has_aux=True)(actor, rows, gated, weights)

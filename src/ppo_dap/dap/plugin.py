@@ -27,10 +27,14 @@ from ppo_dap.dap.guide import (
 from ppo_dap.dap.objective import Batch
 from ppo_dap.dap.proposals import ProposalDraws, Proposals
 from ppo_dap.errors import InputError
+from ppo_dap.methods import METHODS, resolve
 from ppo_dap.nets.normalizer import RunningMoments
 from ppo_dap.nets.policy import scale_actions
 from ppo_dap.ppo.update import draw_orders
-from ppo_dap.priors import DiffusionPrior
+from ppo_dap.priors import Prior
+
+_WITHOUT_OUR_PPO = {"q_target": "td", "q_calibration": "none", "guidance_gate": False, "mode_seeking": 0.0}
+"""What needs the advantages or the policy, which a Guide is not given."""
 
 
 class Guide:
@@ -42,24 +46,30 @@ class Guide:
     states (Eq. 9), and nothing to ratios or advantages. Everything is in environment units.
     """
 
-    def __init__(self, prior: DiffusionPrior, *, total_iterations: int, preset: str = "paper", **options: Any):
+    def __init__(self, prior: Prior, *, total_iterations: int, preset: str = "paper", **options: Any):
         """`total_iterations` of the run, for the annealing of beta; `options` are fields of `Config` by name.
 
         Q has a trunk of its own here, since this PPO's value network is not ours to read.
         """
         if not isinstance(total_iterations, int) or total_iterations < 1:
             raise InputError(f"total_iterations must be a whole number above 0, not {total_iterations!r}")
-        self.config = configs.make(preset, **(options | {"q_trunk": "separate"}))
+        given = options | {"q_trunk": "separate"}
+        self.config = resolve(METHODS["ppo-dap"], configs.make(preset, **given), given, prior.kind)
+        for name, right in _WITHOUT_OUR_PPO.items():
+            if configs.flatten(self.config)[name] != right:
+                found = configs.flatten(self.config)[name]
+                raise InputError(f"{name} {found!r} needs this package's own PPO: a Guide has {right!r}")
         self.prior, self.iteration, self._total = prior, 0, total_iterations
+        self._condition = jnp.asarray(prior.condition(self.config.proposals.prior_return))
         self._moments = RunningMoments.create(prior.observation_size)
         self._rewards = RunningMoments.create(1)
         rng = np.random.default_rng(self.config.run.seed)
         sizes = (prior.observation_size, prior.action_size)
-        self._state = create_guide(rng, None, sizes, self.config, prior.denoiser)
-        self._propose = jax.jit(partial(make_proposals, config=self.config, diffusion=prior.config))
+        self._state = create_guide(rng, None, sizes, self.config, prior.network)
+        self._propose = jax.jit(partial(make_proposals, config=self.config))
         self._gate = jax.jit(gate_proposals)
         self._learn_q = jax.jit(partial(learn_q, config=self.config))
-        self._adapt = jax.jit(partial(adapt_prior, config=self.config, diffusion=prior.config))
+        self._adapt = jax.jit(partial(adapt_prior, config=self.config))
         self.metrics: dict[str, float] = {}
         """Of the last call: ess, spr, q_loss, pet_loss, pet_spr, adapter_norm and others."""
 
@@ -85,24 +95,27 @@ class Guide:
         progress = self.iteration / self._total
         updates = self.config.ppo.num_epochs * len(rows.weights) // self.config.ppo.minibatch_size
         rng = np.random.default_rng([self.config.run.seed, self.iteration])
-        n, act, proposals = len(rows.weights), self.prior.action_size, self.config.proposals
+        n, proposals = len(rows.weights), self.config.proposals
         beta = beta_schedule(progress, self.config.proposals.beta_max, self.config.proposals.beta_anneal)
-        denoiser, state = self.prior.denoiser, self._state
-        draws = ProposalDraws.make(rng, n, num_proposal_states(n, 1, self.config), act, proposals)
+        network, state = self.prior.network, self._state
+        draws = ProposalDraws.make(rng, n, num_proposal_states(n, 1, self.config), network, proposals)
         visited = Visited(rows.state_ids, rows.raw_observations, rows.observations, rows.weights)
-        proposed = self._propose(state.proposer(denoiser, None), visited, jnp.asarray(beta, jnp.float32), draws)
+        proposer = state.proposer(network, self._condition, None, None)
+        proposed = self._propose(proposer, visited, jnp.asarray(beta, jnp.float32), draws)
         gated, spread, of_proposals = self._gate(state, [proposed], batch)
-        q, _, q_optimizer, learned = self._learn_q(state, None, rows, draw_orders(rng, self.config.q.q_epochs, n))
-        frequency = self.config.adaptation.pet_frequency
-        due = [steps_until(i, frequency, updates) for i in (self.iteration, self.iteration + 1)]
-        pet = PETDraws.make(rng, act, updates, self.config.adaptation)
-        adapters, optimizer, adapted = self._adapt(
-            state, denoiser, rows, batch, jnp.asarray(due[1] - due[0], jnp.int32), pet
-        )
-        self._state = GuideState(q, q_optimizer, spread, adapters, optimizer)
+        learned = self._learn_q(state, None, None, rows, draw_orders(rng, self.config.q.q_epochs, n))
+        adapters, optimizer, adapted = state.adapters, state.pet_optimizer, {}
+        if adapters is not None:
+            frequency = self.config.adaptation.pet_frequency
+            due = [steps_until(i, frequency, updates) for i in (self.iteration, self.iteration + 1)]
+            pet = PETDraws.make(rng, network, updates, self.config.adaptation)
+            adapters, optimizer, adapted = self._adapt(
+                state, network, rows, batch, jnp.asarray(due[1] - due[0], jnp.int32), pet
+            )
+        self._state = GuideState(learned.q, learned.optimizer, spread, learned.q_rank, None, None, adapters, optimizer)
         self._moments = self._moments.update(np.asarray(rows.raw_observations)[np.asarray(rows.weights) > 0])
         self.iteration += 1
-        self.metrics = {name: float(v) for name, v in (of_proposals | learned | adapted).items()}
+        self.metrics = {name: float(v) for name, v in (of_proposals | learned.metrics | adapted).items()}
         # Rows in which no transition happened can fill up the subset; nobody else would know them from the others.
         kept = np.flatnonzero(np.asarray(gated.gate))
         return self._in_environment_units(jax.tree.map(lambda x: x[kept], gated.proposals))

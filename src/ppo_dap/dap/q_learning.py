@@ -28,10 +28,23 @@ class QData(eqx.Module):
 
 
 def q_loss(q: QFunction, critic: Critic | None, rows: QData, shared: bool) -> Float[Array, ""]:
-    """Mean squared error of Q(s, a) against r + gamma (1 - terminated) V(s')."""
+    """Mean squared error of Q(s, a) against its target, r + gamma (1 - terminated) V(s') in the paper; of all heads."""
     features = q_features(critic, q, rows.observations, shared)
-    values = q(features, rows.actions[:, None, :])[:, 0]
-    return weighted_mean(jnp.square(values - rows.targets), rows.weights)
+    values = [head(features, rows.actions[:, None, :])[:, 0] for head in q.heads]
+    return jnp.asarray(sum(weighted_mean(jnp.square(v - rows.targets), rows.weights) for v in values))
+
+
+def rank_correlation(
+    x: Float[Array, " rows"], y: Float[Array, " rows"], weights: Float[Array, " rows"]
+) -> Float[Array, ""]:
+    """Spearman's rho (5.7) over the rows with weight; 0 where one of the two does not vary. Ties keep their order."""
+
+    def ranks(values):
+        return jnp.argsort(jnp.argsort(jnp.where(weights > 0, values, jnp.inf))).astype(jnp.float32)
+
+    kept = (weights > 0).astype(jnp.float32)
+    a, b = (kept * (r - weighted_mean(r, kept)) for r in (ranks(x), ranks(y)))
+    return jnp.sum(a * b) / jnp.maximum(jnp.sqrt(jnp.sum(a * a) * jnp.sum(b * b)), 1e-8)
 
 
 def trainable(q: QFunction, critic: Critic | None, config: QConfig) -> tuple:

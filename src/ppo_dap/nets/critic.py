@@ -36,13 +36,33 @@ def create_trunk(rng: np.random.Generator, observation_size: int, hidden_size: i
     return MLP.create(rng, (observation_size, hidden_size, hidden_size), "tanh", final_gain=2**0.5)
 
 
-class QFunction(eqx.Module):
-    """Q_phi(s, a) for guidance only: the state part is computed once per state, the action part once per proposal."""
+class QHead(eqx.Module):
+    """Features and action to a number: the state part is computed once per state, the action part once per proposal."""
 
-    trunk: MLP | None
     state: Linear
     action: Linear
     out: Linear
+
+    @staticmethod
+    def create(rng: np.random.Generator, feature_size: int, action_size: int, hidden_size: int) -> QHead:
+        """Orthogonal start."""
+        return QHead(
+            Linear.orthogonal(rng, feature_size, hidden_size, 2**0.5),
+            Linear.orthogonal(rng, action_size, hidden_size, 2**0.5),
+            Linear.orthogonal(rng, hidden_size, 1, 1.0),
+        )
+
+    def __call__(self, features: Float[Array, "n width"], actions: Float[Array, "n k act"]) -> Float[Array, "n k"]:
+        """The head's value of k actions of each state."""
+        hidden = jnp.tanh(self.state(features)[:, None, :] + self.action(actions))
+        return self.out(hidden)[..., 0]
+
+
+class QFunction(eqx.Module):
+    """Q_phi(s, a) for guidance only: one head, or several that differ by their start."""
+
+    trunk: MLP | None
+    heads: tuple[QHead, ...]
 
     @staticmethod
     def create(
@@ -52,20 +72,25 @@ class QFunction(eqx.Module):
         feature_size: int,
         hidden_size: int,
         own_trunk: bool,
+        num_heads: int = 1,
     ) -> QFunction:
-        """A head on features of `feature_size`, with a trunk of its own when `own_trunk`."""
+        """Heads on features of `feature_size`, with a trunk of their own when `own_trunk`."""
         trunk = create_trunk(rng, observation_size, feature_size) if own_trunk else None
-        return QFunction(
-            trunk,
-            Linear.orthogonal(rng, feature_size, hidden_size, 2**0.5),
-            Linear.orthogonal(rng, action_size, hidden_size, 2**0.5),
-            Linear.orthogonal(rng, hidden_size, 1, 1.0),
-        )
+        heads = (QHead.create(rng, feature_size, action_size, hidden_size) for _ in range(num_heads))
+        return QFunction(trunk, tuple(heads))
 
-    def __call__(self, features: Float[Array, "n width"], actions: Float[Array, "n k act"]) -> Float[Array, "n k"]:
-        """Q at k actions of each state, in scaled-reward units; actions are scaled."""
-        hidden = jnp.tanh(self.state(features)[:, None, :] + self.action(actions))
-        return self.out(hidden)[..., 0]
+    def __call__(
+        self, features: Float[Array, "n width"], actions: Float[Array, "n k act"], pessimism: float = 0.0
+    ) -> Float[Array, "n k"]:
+        """Q at k actions of each state, in scaled-reward units; actions are scaled.
+
+        It is the heads' mean less `pessimism` times their spread: a lower bound.
+        """
+        if len(self.heads) == 1:
+            return self.heads[0](features, actions)
+        values = jnp.stack([head(features, actions) for head in self.heads])
+        mean = jnp.mean(values, axis=0)
+        return mean - pessimism * jnp.sqrt(jnp.var(values, axis=0) + 1e-12)
 
 
 def q_features(

@@ -130,11 +130,11 @@ def value_loss(critic: Critic, rows: Rows) -> Float[Array, ""]:
     return weighted_mean(jnp.square(critic(rows.observations) - rows.returns), rows.weights)
 
 
-AddedGradient = Callable[[Actor, Any, Any], tuple[Actor, dict[str, Float[Array, ""]]]]
-"""(actor, minibatch of what the method adds, its weights) -> gradient to add to PPO's, and metrics."""
+AddedGradient = Callable[[Actor, Rows, Any, Any], tuple[Actor, dict[str, Float[Array, ""]]]]
+"""(actor, minibatch of D_on, minibatch of what the method adds, weights) -> gradient to add to PPO's, and metrics."""
 
 
-def nothing_to_add(actor: Actor, minibatch: Any, weights: Any) -> tuple[Actor, dict[str, Float[Array, ""]]]:
+def nothing_to_add(actor: Actor, rows: Rows, minibatch: Any, weights: Any) -> tuple[Actor, dict[str, Float[Array, ""]]]:
     """Stands for `added_gradient` in plain PPO, whose `Settings.adds` is False: never called on numbers."""
     return actor, {}
 
@@ -217,9 +217,9 @@ def _actor_step(carry, batch, settings: Settings, old_log_std, ppo: PPOConfig, a
     # A branch of its own in every program, taken or not: the compiler cannot fuse PPO's part with what is added, so
     # PPO's bits are the same with and without (a barrier is not enough: XLA's CPU compiler removes it before fusing).
     add = added_gradient or nothing_to_add
-    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(add, actor, extra, settings.added_weights))
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(add, actor, own, extra, settings.added_weights))
     extra_gradient, extra_metrics = jax.lax.cond(
-        settings.adds, lambda: add(actor, extra, settings.added_weights), lambda: zeros
+        settings.adds, lambda: add(actor, own, extra, settings.added_weights), lambda: zeros
     )
     gradient = jax.tree.map(jnp.add, gradient, extra_gradient)
     metrics |= extra_metrics

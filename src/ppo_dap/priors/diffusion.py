@@ -219,6 +219,13 @@ def sample_actions(
     def denoise(x, sigma):
         return denoiser(x, embedding, sigma, adapters)
 
+    if solver.condition_weight != 1 and config.num_conditions:
+        free, asked = denoiser.embed(observations, jnp.zeros_like(condition)), denoise
+
+        def denoise(x, sigma):
+            unconditioned = denoiser(x, free, sigma, adapters)
+            return unconditioned + solver.condition_weight * (asked(x, sigma) - unconditioned)
+
     if solver.name == "dpmpp_2m":
         noise = centred_start(denoise, sigmas[0], noise[0])[None]
     return SAMPLERS[solver.name](denoise, sigmas, noise, drift, displacement_cap)

@@ -169,7 +169,7 @@ def train_network(
     start = time.perf_counter()
     while step < config.max_steps:
         picks = rng.integers(0, train.actions.shape[0], size, dtype=np.int32)
-        draws = Draws(state.network.draw_loss(rng, *size), _shown(rng, size, config))
+        draws = Draws(state.network.draw_loss(rng, *size), _shown(rng, size, config))  # type: ignore[arg-type]
         state, losses = train_chunk(state, train, held_out, picks, draws, held_out_draws, config)
         step = int(state.step)
         train_loss, validation_loss = (float(loss) for loss in losses)

@@ -17,6 +17,17 @@ from ppo_dap.priors.samplers import Field, Solver
 
 
 @runtime_checkable
+class ClosedForm(Protocol):
+    """A network whose distribution is a Gaussian that it can name: no proxy has to be estimated from samples."""
+
+    def gaussian(
+        self, observations: Float[Array, "n obs"], condition: Float[Array, "n c"]
+    ) -> tuple[Float[Array, "n act"], Float[Array, "n act"]]:
+        """Mean and standard deviation at each state."""
+        ...
+
+
+@runtime_checkable
 class Network(Protocol):
     """A family of conditional distributions, of which an instance is one."""
 

@@ -158,7 +158,8 @@ def load_prior(path: str | Path) -> Prior:
         raise InputError(f"{path} is damaged: {missing[0]} is missing")
     try:
         config = PRIOR_CONFIGS[header["prior"]](**header["config"])
-        others = {name: header[name] for name in _HEADER} | {name: tensors[name] for name in _ARRAYS}
+        others: dict[str, Any] = {name: header[name] for name in _HEADER}
+        others |= {name: tensors[name] for name in _ARRAYS}
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} is damaged: its header lacks or misnames {error}") from error
     network = _read_network(NETWORKS[config.kind], config, tensors, path)

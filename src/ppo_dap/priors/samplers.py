@@ -110,10 +110,12 @@ SAMPLERS = {"ancestral": ancestral, "dpmpp_2m": dpmpp_2m}
 
 
 class Solver(NamedTuple):
-    """A sampler by name and its number of steps."""
+    """A sampler by name, its number of steps, and how far it goes towards what the prior is asked for."""
 
     name: str
     num_steps: int
+    condition_weight: float = 1.0
+    """Classifier-free guidance (Ho & Salimans, 2022): 1 is the conditioned prior, 0 the unconditioned one."""
 
     def noise_shape(self, *size: int) -> tuple[int, ...]:
         """Shape of the unit noise for actions of `size`: all of it is drawn before the loop, the deterministic

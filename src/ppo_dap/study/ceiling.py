@@ -55,18 +55,18 @@ def sampler_of_gemm(prior_file: Path) -> float:
     import jax.numpy as jnp
 
     from ppo_dap.priors import load_prior
-    from ppo_dap.priors.samplers import Solver, sample_actions
+    from ppo_dap.priors.samplers import Solver
 
-    prior: Any = load_prior(prior_file)
-    denoiser, config = prior.denoiser, prior.config
+    prior = load_prior(prior_file)
+    denoiser, config = prior.network, prior.config
     solver, rng = Solver("ancestral", 20), np.random.default_rng(0)
 
     def numbers(*shape: int) -> jax.Array:
         return jnp.asarray(rng.standard_normal(shape, dtype=np.float32))
 
     observations, condition = numbers(STATES, prior.observation_size), numbers(STATES, config.num_conditions)
-    noise = numbers(*solver.noise_shape(STATES, PROPOSALS, prior.action_size))
-    sample = jax.jit(lambda denoiser, o, noise: sample_actions(denoiser, None, o, condition, noise, solver, config)[0])
+    noise = numbers(*denoiser.noise_shape(solver, STATES, PROPOSALS))
+    sample = jax.jit(lambda denoiser, o, noise: denoiser.sample(o, condition, noise, solver)[0])
     weights = [layer.weight.T for layer in (denoiser.action_in, *denoiser.hidden, denoiser.out)]
     inputs = [numbers(STATES * PROPOSALS, weight.shape[0]) for weight in weights]
 

@@ -12,6 +12,10 @@ COMPILED_AFTER = 2
 """Iterations in which programs are compiled; they do not count as cost."""
 
 
+AUDIT = {(True, True): "strictly on-policy", (False, True): "not on-policy, as declared", (False, False): "VIOLATED"}
+"""(strictly on-policy, as its method's row says) -> what a table says."""
+
+
 def summarise(runs: Sequence[Run], epochs: float = 40) -> list[dict[str, Any]]:
     """A row a run; `x_ppo` and `wall_x_ppo` compare it with the plain PPO run of the same task, seed and steps."""
     rows = [_row(run, epochs) for run in runs]
@@ -29,6 +33,7 @@ def _pair(row: dict[str, Any]) -> tuple:
 
 def _row(run: Run, epochs: float) -> dict[str, Any]:
     evaluations, config = run.evaluations, run.config["config"]
+    strictly, declared = run.verdict()
     reached = evaluations[-1]["env_steps"] >= epochs * EPOCH
     return {
         "run": str(run.folder),
@@ -41,7 +46,8 @@ def _row(run: Run, epochs: float) -> dict[str, Any]:
         "alc": alc(evaluations, epochs) if reached else None,
         "last_return": evaluations[-1]["return_mean"],
         "seconds": sum(row["seconds_iteration"] for row in run.metrics[COMPILED_AFTER:]),
-        "audit": all(claim.holds for claim in run.audit()),
+        "audit": strictly,
+        "declared": declared,
     }
 
 
@@ -72,6 +78,6 @@ def print_summary(rows: Sequence[dict[str, Any]], epochs: float, title: str | No
             number(row["last_return"], 0),
             number(row["seconds"], 0) + " s",
             number(row["wall_x_ppo"], 2),
-            "strictly on-policy" if row["audit"] else "VIOLATED",
+            AUDIT[row["audit"], row["declared"]],
         )
     Console(width=120).print(table)

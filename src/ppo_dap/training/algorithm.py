@@ -17,7 +17,6 @@ from ppo_dap.dap import audit
 from ppo_dap.dap.guide import (
     GuideState,
     Proposed,
-    Proposer,
     Visited,
     adapt_prior,
     create_guide,
@@ -26,12 +25,12 @@ from ppo_dap.dap.guide import (
     make_proposals,
     on_policy,
 )
-from ppo_dap.dap.objective import Batch, admit, proposal_gradient
-from ppo_dap.dap.proposals import ProposalDraws
+from ppo_dap.dap.objective import Batch, added_gradient, admit
+from ppo_dap.dap.proposals import ProposalDraws, Proposer
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import Normaliser, PPOState, Rows, Settings, estimate_advantages, improve_actor, improve_critic
-from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
+from ppo_dap.priors.network import Network
 from ppo_dap.training.draws import Draws
 
 NETWORK_STREAM = 5
@@ -47,9 +46,10 @@ class Learner(eqx.Module):
 
 
 class Frozen(NamedTuple):
-    """The prior as Stage I left it, and the offline minibatch of the leakage audit."""
+    """The prior as Stage I left it, what it is asked for, and the offline minibatch of the leakage audit."""
 
-    denoiser: Denoiser
+    prior: Network
+    condition: Float[Array, " c"]
     probe: audit.Probe
 
 
@@ -62,31 +62,37 @@ class Schedule(NamedTuple):
     pet_steps: Int[Array, ""]
 
 
-def create_learner(sizes: tuple[int, int], config: Config, denoiser: Denoiser | None) -> Learner:
+def create_learner(sizes: tuple[int, int], config: Config, prior: Network | None) -> Learner:
     """Fresh networks by the config's seed; the guide's come after PPO's, whose start does not depend on them."""
     rng = np.random.default_rng([config.run.seed, NETWORK_STREAM])
     ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size)
-    if denoiser is None:
+    if prior is None:
         return Learner(ppo, None)
-    return Learner(ppo, create_guide(rng, ppo.critic, sizes, config, denoiser))
+    return Learner(ppo, create_guide(rng, ppo.critic, sizes, config, prior))
 
 
 class Stages:
-    """The stages of an iteration as jitted functions of arrays, for one configuration."""
+    """The stages of an iteration as jitted functions of arrays, for one configuration, with a guide or without."""
 
-    def __init__(self, config: Config, diffusion: DiffusionConfig | None):
+    def __init__(self, config: Config, guided: bool):
         self.advantages = jax.jit(partial(_advantages, config=config))
-        added_gradient = None if diffusion is None else proposal_gradient
-        self.actor = jax.jit(partial(improve_actor, ppo=config.ppo, added_gradient=added_gradient))
+        added = partial(added_gradient, config=config.objective) if adds(config, guided) else None
+        self.actor = jax.jit(partial(improve_actor, ppo=config.ppo, added_gradient=added))
         self.critic = jax.jit(partial(improve_critic, ppo=config.ppo))
         self.policy_metrics = jax.jit(audit.policy_metrics)
-        if diffusion is not None:
-            self.propose = jax.jit(partial(_propose, config=config, diffusion=diffusion))
+        self.seeks_mode = config.proposals.mode_seeking > 0
+        if guided:
+            self.propose = jax.jit(partial(_propose, config=config))
             self.gate = jax.jit(gate_proposals)
             self.learn_q = jax.jit(partial(learn_q, config=config))
-            self.adapt = jax.jit(partial(adapt_prior, config=config, diffusion=diffusion))
-            self.leakage = jax.jit(partial(audit.leakage, ppo=config.ppo))
-            self.prior_metrics = jax.jit(partial(audit.prior_metrics, diffusion=diffusion, config=config.proposals))
+            self.adapt = jax.jit(partial(adapt_prior, config=config))
+            self.leakage = jax.jit(partial(audit.leakage, config=config))
+            self.prior_metrics = jax.jit(partial(audit.prior_metrics, config=config.proposals))
+
+
+def adds(config: Config, guided: bool) -> bool:
+    """Whether a method adds something to PPO's objective."""
+    return guided or config.objective.lambda_awr > 0
 
 
 def _advantages(
@@ -114,12 +120,11 @@ def _propose(
     draws: ProposalDraws,
     *,
     config: Config,
-    diffusion: DiffusionConfig,
 ) -> Proposed:
     raw = observations.reshape(-1, observations.shape[-1])
     normalised = normaliser(raw, config.ppo.observation_clip)
     visited = Visited(state_ids.reshape(-1), raw, normalised, valid.reshape(-1).astype(jnp.float32))
-    return make_proposals(proposer, visited, beta, draws, config=config, diffusion=diffusion)
+    return make_proposals(proposer, visited, beta, draws, config=config)
 
 
 def call(name: str, stage: Callable[..., Any], *arguments: Any) -> Any:
@@ -168,22 +173,25 @@ def iterate(
     if guide is None or frozen is None:
         return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None), metrics
     visited = on_policy(rows)
-    q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, visited, draws.q)
+    learned = run("update", stages.learn_q, guide, critic, old.critic, visited, draws.q)
+    critic = learned.critic
 
     # 5) PET: the adapters alone, on D_on.
-    adapters, pet_optimizer, adapted = run(
-        "pet", stages.adapt, guide, frozen.denoiser, visited, batch, schedule.pet_steps, draws.pet
-    )
+    adapters, pet_optimizer, adapted = guide.adapters, guide.pet_optimizer, {}
+    if adapters is not None:
+        adapters, pet_optimizer, adapted = run(
+            "pet", stages.adapt, guide, frozen.prior, visited, batch, schedule.pet_steps, draws.pet
+        )
 
     # 6) Monitoring.
     norm = improved["actor_gradient_norm"]
     leaked = run("audit", stages.leakage, actor, frozen.probe, normaliser, rows, batch, weights, norm)
-    moved = run(
-        "audit", stages.prior_metrics, actor, frozen.denoiser, guide.adapters, adapters, gated.proposals, draws.audit
-    )
+    prior = frozen.prior, frozen.condition, guide.adapters, adapters
+    moved = run("audit", stages.prior_metrics, actor, *prior, gated.proposals, draws.audit)
     ppo = PPOState(actor, critic, actor_optimizer, critic_optimizer)
-    guide = GuideState(q, q_optimizer, q_spread, adapters, pet_optimizer)
-    return Learner(ppo, guide), metrics | learned | adapted | leaked | moved
+    own = learned.q, learned.optimizer, q_spread, learned.q_rank, guide.calibration, learned.judged
+    guide = GuideState(*own, adapters, pet_optimizer)
+    return Learner(ppo, guide), metrics | learned.metrics | adapted | leaked | moved
 
 
 def _collect_and_propose(
@@ -199,7 +207,8 @@ def _collect_and_propose(
     """All parts of the rollout, and the proposals on each, dispatched before the next is collected."""
     proposer = None
     if learner.guide is not None and frozen is not None:
-        proposer = learner.guide.proposer(frozen.denoiser, learner.ppo.critic)
+        actor = learner.ppo.actor if stages.seeks_mode else None
+        proposer = learner.guide.proposer(frozen.prior, frozen.condition, learner.ppo.critic, actor)
     parts, proposed = [], []
     for part in rollout:
         if proposer is not None:

@@ -17,7 +17,9 @@ from ppo_dap.dap.adaptation import PETDraws
 from ppo_dap.dap.audit import PROXY_SOLVER, PROXY_STATES
 from ppo_dap.dap.guide import num_proposal_states
 from ppo_dap.dap.proposals import ProposalDraws
+from ppo_dap.nets.adapters import Backbone
 from ppo_dap.ppo.update import Orders, draw_orders
+from ppo_dap.priors.network import Network
 
 PARTS = 8
 """Most parts of a rollout: proposals on each are computed while the next is collected."""
@@ -40,25 +42,24 @@ def num_parts(config: Config) -> int:
     return math.gcd(PARTS, config.ppo.rollout_steps // config.ppo.num_envs)
 
 
-def draw(config: Config, iteration: int, action_size: int, guided: bool) -> Draws:
-    """The draws of an iteration. PPO's have a stream of their own: a guide does not change them."""
+def draw(config: Config, iteration: int, prior: Network | None) -> Draws:
+    """The draws of an iteration. PPO's have a stream of their own: a guide with its prior does not change them."""
     ppo, rows = config.ppo, config.ppo.rollout_steps
     rng = np.random.default_rng([config.run.seed, PPO_STREAM, iteration])
     actor, critic = (draw_orders(rng, ppo.num_epochs, rows) for _ in range(2))
-    if not guided:
+    if prior is None:
         return Draws(Orders(actor, np.zeros((ppo.num_epochs, 0), np.int32)), critic)  # type: ignore[arg-type]
     rng = np.random.default_rng([config.run.seed, GUIDE_STREAM, iteration])
     parts = num_parts(config)
     states = num_proposal_states(rows, parts, config)
     few, k = min(PROXY_STATES, states), config.proposals.num_proposals
+    adapted = config.adaptation.pet_frequency > 0 and isinstance(prior, Backbone)
     updates = ppo.num_epochs * rows // ppo.minibatch_size
     return Draws(
         Orders(actor, draw_orders(rng, ppo.num_epochs, states)),  # type: ignore[arg-type]
         critic,
-        tuple(
-            ProposalDraws.make(rng, rows // parts, states // parts, action_size, config.proposals) for _ in range(parts)
-        ),
+        tuple(ProposalDraws.make(rng, rows // parts, states // parts, prior, config.proposals) for _ in range(parts)),
         draw_orders(rng, config.q.q_epochs, rows),
-        PETDraws.make(rng, action_size, updates, config.adaptation),
-        rng.standard_normal(PROXY_SOLVER.noise_shape(few, k, action_size), dtype=np.float32),
+        PETDraws.make(rng, prior, updates, config.adaptation) if adapted else (),
+        rng.standard_normal(prior.noise_shape(PROXY_SOLVER, few, k), dtype=np.float32),
     )

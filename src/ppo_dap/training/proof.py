@@ -15,7 +15,7 @@ from ppo_dap.dap.guide import GuideState
 from ppo_dap.dap.objective import Weights
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import Normaliser, PPOState, Settings
-from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, call, iterate
+from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, adds, call, iterate
 from ppo_dap.training.draws import draw, num_parts
 
 
@@ -33,27 +33,26 @@ def prove(
         "ppo_optimizers": (learner.ppo.actor_optimizer, learner.ppo.critic_optimizer),
         "on_policy": (example_rollout(config, *sizes), np.float32(1)),
         "normaliser": Normaliser(np.zeros(sizes[0], np.float32), np.ones(sizes[0], np.float32)),  # type: ignore[arg-type]
-        "schedule": example_schedule(guided=learner.guide is not None),
-        "draws": draw(config, 0, sizes[1], learner.guide is not None),
+        "schedule": example_schedule(config, guided=learner.guide is not None),
+        "draws": draw(config, 0, None if frozen is None else frozen.prior),
     }
     if learner.guide is not None and frozen is not None:
         guide = learner.guide
         arguments |= {
-            "q": (guide.q, guide.q_optimizer, guide.q_spread),
+            "q": (guide.q, guide.q_optimizer, guide.q_spread, guide.q_rank, guide.calibration, guide.judged),
             "adapters": (guide.adapters, guide.pet_optimizer),
-            "backbone": frozen.denoiser,
+            "backbone": (frozen.prior, frozen.condition),
             "offline": frozen.probe,
         }
 
     def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, draws, **guided):
         guide = None
         if guided:
-            (q, q_optimizer, spread), (adapters, pet_optimizer) = guided["q"], guided["adapters"]
-            guide = GuideState(q, q_optimizer, spread, adapters, pet_optimizer)
+            guide = GuideState(*guided["q"], *guided["adapters"])
         rollout, reward_std = on_policy
         new, _ = iterate(
             Learner(PPOState(actor, critic, *ppo_optimizers), guide),
-            Frozen(guided["backbone"], guided["offline"]) if guided else None,
+            Frozen(*guided["backbone"], probe=guided["offline"]) if guided else None,
             rollout,
             normaliser,
             lambda: reward_std,
@@ -64,7 +63,7 @@ def prove(
         )
         ppo, g = new.ppo, new.guide
         results = {"actor": ppo.actor, "critic": ppo.critic, "rest": (ppo.actor_optimizer, ppo.critic_optimizer, g)}
-        return results if g is None else results | {"adapters": g.adapters}
+        return results if g is None or g.adapters is None else results | {"adapters": g.adapters}
 
     traced = trace(whole_update, arguments)
     full = traced.flow(sources=("proposals",))
@@ -83,8 +82,9 @@ def example_rollout(config: Config, observation_size: int, action_size: int) -> 
     return [Rollout(state_ids=np.zeros(grid, np.int32), **wide, **flags, **scalars)] * parts  # type: ignore[arg-type]
 
 
-def example_schedule(guided: bool) -> Schedule:
+def example_schedule(config: Config, guided: bool) -> Schedule:
     """A schedule of zeros, for tracing."""
     zero, none = jnp.asarray(np.float32(0)), jnp.asarray(np.int32(0))
-    settings = Settings(zero, zero, jnp.asarray(guided), Weights(zero, zero) if guided else ())
+    added = adds(config, guided)
+    settings = Settings(zero, zero, jnp.asarray(added), Weights(zero, zero, zero) if added else ())
     return Schedule(none, settings, zero, none)

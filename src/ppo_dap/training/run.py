@@ -10,6 +10,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ppo_dap import config as configs
 from ppo_dap.config import Config
@@ -20,7 +21,7 @@ from ppo_dap.logs.check import family
 from ppo_dap.methods import Method, get_method, resolve
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy, load_policy
-from ppo_dap.priors import DiffusionPrior, load_prior
+from ppo_dap.priors import Prior, load_prior, random_prior
 from ppo_dap.storage import write_atomically
 from ppo_dap.tasks import TaskSpec, describe
 from ppo_dap.training.ahead import CompileAhead
@@ -71,7 +72,13 @@ class Run:
         if not path.is_file():
             raise InputError(f"{self.folder} has no audit.json: is it a run folder?")
         static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
-        return static + audit.measured_claims(self.metrics, guided=self.config["prior_hash"] is not None)
+        guided, config = self.config["prior_hash"] is not None, self.config["config"]
+        return static + audit.measured_claims(self.metrics, guided, guided and config["pet_frequency"] > 0)
+
+    def verdict(self) -> tuple[bool, bool]:
+        """Whether the run was strictly on-policy, and whether that is what its method's row says it is."""
+        strictly = all(claim.holds for claim in self.audit())
+        return strictly, strictly or not get_method(self.config["method"]).strictly_on_policy
 
 
 def _read_config(folder: Path) -> dict[str, Any]:
@@ -97,7 +104,7 @@ def train(
     task: str,
     method: str = "ppo-dap",
     *,
-    prior: DiffusionPrior | str | Path | None = None,
+    prior: Prior | str | Path | None = None,
     logs: Logs | str | Path | None = None,
     out: str | Path,
     preset: str = "paper",
@@ -116,11 +123,11 @@ def train(
     chosen = get_method(method)
     spec = describe(task)
     of_task = {} if spec.gamma is None else {"gamma": spec.gamma}
-    config = resolve(chosen, configs.make(preset, **of_task | options), options)
-    if chosen.needs_logs and config.warm.warm_start == "none":
-        config = configs.replace(config, warm_start="actor")
-    folder = Path(out)
+    config = configs.make(preset, **of_task | options)
     prior = _check_prior(chosen, prior, spec)
+    config = resolve(chosen, config, options, None if prior is None else prior.kind)
+    condition = None if prior is None else prior.condition(config.proposals.prior_return)
+    folder = Path(out)
     logs = _check_logs(config, logs, spec)
     description = {
         "task": spec.task,
@@ -131,7 +138,7 @@ def train(
         "logs_hash": None if logs is None else logs.hash(),
     }
     _check_folder(folder, description, resume)
-    trainer = _make_trainer(config, spec, prior, logs, folder, description, resume, progress)
+    trainer = _make_trainer(config, spec, prior, condition, logs, folder, description, resume, progress)
     trainer.run()
     return Run(folder)
 
@@ -139,7 +146,8 @@ def train(
 def _make_trainer(
     config: Config,
     spec: TaskSpec,
-    prior: DiffusionPrior | None,
+    prior: Prior | None,
+    condition: Float[np.ndarray, " c"] | None,
     logs: Logs | None,
     folder: Path,
     description: dict[str, Any],
@@ -147,13 +155,11 @@ def _make_trainer(
     show: bool,
 ) -> Trainer:
     sizes = (spec.observation_size, spec.action_size)
-    frozen, diffusion = None, None
+    frozen = None
     if prior is not None:
-        diffusion = prior.config
-        frozen = Frozen(
-            prior.denoiser, audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions))
-        )
-    learner = create_learner(sizes, config, None if frozen is None else frozen.denoiser)
+        probe = audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions))
+        frozen = Frozen(prior.network, jnp.asarray(condition), probe)
+    learner = create_learner(sizes, config, None if frozen is None else frozen.prior)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
     lines = None
     checkpoint = folder / "checkpoints" / "last.safetensors"
@@ -162,7 +168,7 @@ def _make_trainer(
         lines = run["lines"]
     elif logs is not None:
         state = warm_start(state, logs, spec, config)
-    stages = Stages(config, diffusion)
+    stages = Stages(config, guided=frozen is not None)
     ahead = CompileAhead()
     claims = prove(learner, frozen, config, stages, ahead.trace)
     if lines is None:
@@ -175,14 +181,22 @@ def _make_trainer(
     )
 
 
-def _check_prior(method: Method, prior: Any, spec: TaskSpec) -> DiffusionPrior | None:
+def _check_prior(method: Method, prior: Any, spec: TaskSpec) -> Prior | None:
     if method.prior == "none":
         if prior is not None:
             raise InputError(f"method {method.name} has no prior, but prior {prior} was given: leave it out")
         return None
     if prior is None:
-        raise InputError(f"method {method.name} needs a prior: fit one with `ppo-dap pretrain` and pass it as prior")
-    prior = prior if isinstance(prior, DiffusionPrior) else load_prior(prior)
+        fit = f"`ppo-dap pretrain --kind {method.prior}`"
+        raise InputError(f"method {method.name} needs a {method.prior} prior: fit one with {fit} and pass it as prior")
+    if isinstance(prior, str) and prior == "random":
+        return random_prior(spec.observation_size, spec.action_low, spec.action_high, spec.task)
+    prior = prior if isinstance(prior, Prior) else load_prior(prior)
+    if prior.kind not in (method.prior, "random"):
+        raise InputError(
+            f"method {method.name} needs a {method.prior} prior, but this one is of kind {prior.kind!r}: fit one with "
+            f"`ppo-dap pretrain --kind {method.prior}`, or choose the method of that prior"
+        )
     for name in ("observation_size", "action_size"):
         if getattr(prior, name) != getattr(spec, name):
             raise InputError(

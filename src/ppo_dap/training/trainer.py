@@ -20,6 +20,7 @@ from ppo_dap.config import Config
 from ppo_dap.dap import audit
 from ppo_dap.dap.adaptation import steps_until
 from ppo_dap.dap.guidance import beta_schedule
+from ppo_dap.dap.guide import recalibrated
 from ppo_dap.dap.objective import Weights
 from ppo_dap.errors import TrainingDiverged
 from ppo_dap.nets.policy import Policy
@@ -27,7 +28,7 @@ from ppo_dap.ppo.rollout import Collector, Rollout
 from ppo_dap.ppo.update import Normaliser, Settings
 from ppo_dap.storage import write_atomically
 from ppo_dap.tasks import TaskSpec, make_vector_env
-from ppo_dap.training.algorithm import Frozen, Schedule, Stages, iterate
+from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, adds, iterate
 from ppo_dap.training.clock import Clock
 from ppo_dap.training.cores import pinned
 from ppo_dap.training.draws import Draws, draw, num_parts
@@ -36,7 +37,7 @@ from ppo_dap.training.history import History
 from ppo_dap.training.recording import Progress, Recorder
 from ppo_dap.training.state import TrainState, save_checkpoint
 
-LOSSES = ("ppo_loss", "value_loss", "kl_loss", "aux_loss", "q_loss", "pet_loss")
+LOSSES = ("ppo_loss", "value_loss", "kl_loss", "aux_loss", "awr_loss", "q_loss", "pet_loss")
 EXPLODED = 1e8
 """A loss beyond this is not coming back."""
 ROLLOUT_STREAM, ENV_STREAM, EVALUATION_STREAM = 0, 1, 2
@@ -127,7 +128,7 @@ class Trainer:
         state, config, start = self.state, self.config, time.perf_counter()
         parts: list[Rollout] = []
         state.learner, metrics = iterate(
-            state.learner,
+            self._calibrated(state.learner),
             self.frozen,
             self._collect(collector, parts),
             Normaliser(_array(state.observations.mean), _array(state.observations.std)),
@@ -156,6 +157,11 @@ class Trainer:
             self._reduce_lr(float(metrics["policy_kl"]))
         self._pending = Pending(row, metrics, self.clock.turn(), time.perf_counter() - start)
 
+    def _calibrated(self, learner: Learner) -> Learner:
+        if learner.guide is None:
+            return learner
+        return Learner(learner.ppo, recalibrated(learner.guide, self.config.q))
+
     def _collect(self, collector: Collector, parts: list[Rollout]) -> Iterator[Rollout]:
         """The rollout, part by part; `parts` keeps them."""
         state, config = self.state, self.config
@@ -182,7 +188,7 @@ class Trainer:
     def _draws(self, iteration: int) -> Draws:
         if self._next_draws is not None and self._next_draws[0] == iteration:
             return self._next_draws[1]
-        return draw(self.config, iteration, self.spec.action_size, self.frozen is not None)
+        return draw(self.config, iteration, None if self.frozen is None else self.frozen.prior)
 
     def _reward_std(self, parts: list[Rollout]) -> np.ndarray:
         """What this rollout's rewards are divided by: the running scale with the rollout itself in it."""
@@ -203,11 +209,12 @@ class Trainer:
         decay = 1.0 if objective.lambda_decay is None else max(0.0, 1 - progress / objective.lambda_decay)
         updates = ppo.num_epochs * ppo.rollout_steps // ppo.minibatch_size
         pet = [steps_until(state.iteration + i, config.adaptation.pet_frequency, updates) for i in (0, 1)]
-        guided = self.frozen is not None
-        weights = Weights(_array(objective.lambda_kl * decay), _array(objective.lambda_aux * decay))
+        added = adds(config, self.frozen is not None)
+        lambdas = (objective.lambda_kl, objective.lambda_aux, objective.lambda_awr)
+        weights = Weights(*(_array(weight * decay) for weight in lambdas))
         return Schedule(
             _array(state.iteration * ppo.rollout_steps, np.int32),
-            Settings(_array(rate), _array(limit), _array(guided, np.bool_), weights if guided else ()),
+            Settings(_array(rate), _array(limit), _array(added, np.bool_), weights if added else ()),
             _array(beta_schedule(progress, config.proposals.beta_max, config.proposals.beta_anneal)),
             _array(pet[1] - pet[0], np.int32),
         )

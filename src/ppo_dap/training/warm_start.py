@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ppo_dap.config import Config
 from ppo_dap.errors import InputError
-from ppo_dap.logs import Logs
+from ppo_dap.logs import Logs, best_episodes
 from ppo_dap.nets.actor import Actor, log_prob
 from ppo_dap.nets.critic import Critic, q_features
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
@@ -31,11 +31,13 @@ PATIENCE = 3
 def warm_start(state: TrainState, logs: Logs, spec: TaskSpec, config: Config) -> TrainState:
     """`state` with the normaliser and the actor, and with `actor_critic` also V and Q, started from `logs`.
 
-    Raises `InputError` when V and Q are asked for and the logs have no rewards.
+    Raises `InputError` when V or Q is asked for, or the best episodes, and the logs have no rewards.
     """
     start = config.warm
     if start.warm_start == "none":
         return state
+    if start.logs_filter < 1:
+        logs = best_episodes(logs, start.logs_filter)
     moments = RunningMoments.create(spec.observation_size).update(logs.observations)
     train, held_out = (_data(part, moments, spec, config) for part in logs.split(seed=config.run.seed))
     learner = state.learner
@@ -44,19 +46,22 @@ def warm_start(state: TrainState, logs: Logs, spec: TaskSpec, config: Config) ->
     spread = jnp.sqrt(jnp.mean(jnp.square(train["actions"] - actor(train["observations"])), axis=0))
     actor = eqx.tree_at(lambda a: a.log_std, actor, jnp.log(jnp.maximum(spread, start.warm_start_std_floor)))
     learner = eqx.tree_at(lambda s: s.ppo.actor, learner, actor)
-    reward_scale = state.reward_scale
+    if start.warm_start == "actor" and not start.q_warm_start:
+        return TrainState(learner, moments, state.reward_scale)
+    reward_scale = _reward_scale(logs, config)
+    for part, source in ((train, 0), (held_out, 1)):
+        returns = logs.split(seed=config.run.seed)[source].returns_to_go(config.ppo.gamma)
+        assert returns is not None  # _reward_scale has checked
+        part["returns"] = jnp.asarray(returns / reward_scale.std)
     if start.warm_start == "actor_critic":
-        reward_scale = _reward_scale(logs, config)
-        for part, source in ((train, 0), (held_out, 1)):
-            returns = logs.split(seed=config.run.seed)[source].returns_to_go(config.ppo.gamma)
-            assert returns is not None  # _reward_scale has checked
-            part["returns"] = jnp.asarray(returns / reward_scale.std)
         critic = _fit(learner.ppo.critic, _critic_loss, train, held_out, config)
         learner = eqx.tree_at(lambda s: s.ppo.critic, learner, critic)
-        if learner.guide is not None:
-            q = _fit(learner.guide.q, lambda q, rows: _q_loss(q, critic, rows), train, held_out, config)
-            learner = eqx.tree_at(lambda s: s.guide.q, learner, q)
-    return TrainState(learner, moments, reward_scale)
+    if learner.guide is not None:
+        critic = learner.ppo.critic
+        q = _fit(learner.guide.q, lambda q, rows: _q_loss(q, critic, rows), train, held_out, config)
+        learner = eqx.tree_at(lambda s: s.guide.q, learner, q)
+    # What PPO divides rewards by is a part of the critic's start.
+    return TrainState(learner, moments, reward_scale if start.warm_start == "actor_critic" else state.reward_scale)
 
 
 def _data(logs: Logs, moments: RunningMoments, spec: TaskSpec, config: Config) -> dict[str, Array]:
@@ -69,7 +74,8 @@ def _data(logs: Logs, moments: RunningMoments, spec: TaskSpec, config: Config) -
 def _reward_scale(logs: Logs, config: Config) -> RewardScale:
     """The running scale that PPO would have after the logged rewards, as if one environment had made them."""
     if logs.rewards is None:
-        raise InputError("warm_start 'actor_critic' needs logs with rewards; these have none: use warm_start 'actor'")
+        asked = "warm_start 'actor_critic'" if config.warm.warm_start == "actor_critic" else "q_warm_start"
+        raise InputError(f"{asked} needs logs with rewards; these have none: use warm_start 'actor' alone")
     scale, every = RewardScale.create(1), np.ones((logs.num_rows, 1), bool)
     scale = scale.update(logs.rewards[:, None], logs.episode_ends[:, None], every, config.ppo.gamma)
     return RewardScale(scale.moments, np.zeros(config.ppo.num_envs))
@@ -85,8 +91,9 @@ def _critic_loss(critic: Critic, rows: dict[str, Array]) -> Float[Array, ""]:
 
 
 def _q_loss(q: Any, critic: Critic, rows: dict[str, Array]) -> Float[Array, ""]:
-    values = q(q_features(critic, q, rows["observations"], shared=False), rows["actions"][:, None, :])[:, 0]
-    return jnp.mean(jnp.square(values - rows["returns"]))
+    features = q_features(critic, q, rows["observations"], shared=False)
+    values = [head(features, rows["actions"][:, None, :])[:, 0] for head in q.heads]
+    return jnp.asarray(sum(jnp.mean(jnp.square(v - rows["returns"])) for v in values))
 
 
 def _fit(model: Any, loss: Callable[..., Any], train: dict, held_out: dict, config: Config) -> Any:

@@ -1,0 +1,54 @@
+"""Calibration of Q (5.6): a monotone map from what Q says to the returns that followed, fitted on fresh rows."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+KNOTS = 16
+
+
+class Calibration(NamedTuple):
+    """A piecewise linear map; outside its knots it goes on as in its outermost pieces."""
+
+    q: Float[Array, " knots"]
+    returns: Float[Array, " knots"]
+
+    @staticmethod
+    def identity() -> Calibration:
+        """Changes nothing."""
+        line = jnp.asarray(np.linspace(-1.0, 1.0, KNOTS, dtype=np.float32))
+        return Calibration(line, line)
+
+    def __call__(self, q: Float[Array, "n k"]) -> Float[Array, "n k"]:
+        """Calibrated values."""
+        flat = jnp.interp(q.reshape(-1), self.q, self.returns, left="extrapolate", right="extrapolate")
+        return flat.reshape(q.shape)
+
+
+def calibrate(
+    q: Float[np.ndarray, " rows"], returns: Float[np.ndarray, " rows"], kind: Literal["affine", "isotonic"]
+) -> Calibration:
+    """The map of that kind with the least squared error on the rows, never falling; the identity where Q is constant.
+
+    Raises `ValueError` for rows of different numbers.
+    """
+    from scipy.optimize import isotonic_regression
+
+    order = np.argsort(q, kind="stable")
+    sorted_q, sorted_returns = q[order].astype(np.float64), returns[order].astype(np.float64)
+    # Knots at equal distances in the values, not in the ranks: the map is read where proposals are, off the data too.
+    low, high = np.quantile(sorted_q, [0.02, 0.98])
+    knots = np.linspace(low, high, KNOTS)
+    if not knots[-1] - knots[0] > 1e-6:
+        return Calibration.identity()
+    if kind == "affine":
+        slope, offset = np.polyfit(sorted_q, sorted_returns, 1)
+        values = max(slope, 0.0) * knots + (offset if slope > 0 else sorted_returns.mean())
+    else:
+        fitted = isotonic_regression(sorted_returns).x
+        values = np.interp(knots, sorted_q, fitted)
+    return Calibration(jnp.asarray(knots, jnp.float32), jnp.asarray(values, jnp.float32))
