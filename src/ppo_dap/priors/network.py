@@ -7,13 +7,22 @@ logs. A condition of zeros asks for nothing in particular.
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from ppo_dap.nets.adapters import Adapters
 from ppo_dap.priors.samplers import Field, Solver
+
+
+class Rows(NamedTuple):
+    """Rows to fit to, with scaled actions."""
+
+    observations: Float[Array, "rows obs"]
+    condition: Float[Array, "rows c"]
+    actions: Float[Array, "rows act"]
 
 
 @runtime_checkable
@@ -67,4 +76,18 @@ class Network(Protocol):
         adapters: Adapters | None = None,
     ) -> Float[Array, ""]:
         """What the fit minimises."""
+        ...
+
+
+class BuiltNetwork(Protocol):
+    """A family that is made of its rows at once. It has these in place of `create`, `draw_loss` and `loss`."""
+
+    @staticmethod
+    def build(train: Rows, held_out: Rows, config: Any, rng: np.random.Generator) -> tuple[Any, dict[str, Any]]:
+        """The network, and a summary with `rows`, `steps` (0), `validation_loss` and whatever else there is to say."""
+        ...
+
+    @staticmethod
+    def blank(config: Any, tensors: Mapping[str, np.ndarray]) -> Any:
+        """The shapes of a saved one, for reading it from the `tensors` of its prior's file."""
         ...
