@@ -110,7 +110,15 @@ class RetrievalConfig(FromLogs):
     """Most rows that are kept, drawn by the seed: a search compares each state with all of them."""
 
 
-PRIOR_CONFIGS: dict[str, Any] = {config.kind: config for config in (DiffusionConfig, RetrievalConfig)}
+@dataclass(frozen=True)
+class RandomConfig:
+    """The random control has no settings: it is made without logs and knows no condition."""
+
+    kind: ClassVar[str] = "random"
+    num_conditions: ClassVar[int] = 0
+
+
+PRIOR_CONFIGS: dict[str, Any] = {config.kind: config for config in (DiffusionConfig, RetrievalConfig, RandomConfig)}
 """Kind of prior -> its settings."""
 FITTED = tuple(kind for kind, config in PRIOR_CONFIGS.items() if issubclass(config, FromLogs))
 """The kinds that are made from logs, which `fit_prior` takes."""
