@@ -7,6 +7,7 @@ from scipy import stats
 
 from ppo_dap.errors import InputError
 from ppo_dap.priors import fit_prior, load_prior
+from ppo_dap.priors.network import Network
 from ppo_dap.priors.random import random_prior
 
 LOW, HIGH = np.array([-2.0, 0.0, 1.0]), np.array([2.0, 0.5, 1.0])
@@ -40,6 +41,7 @@ def test_the_test_of_uniformity_finds_what_is_not(control):
 def test_it_says_what_it_is(control):
     assert (control.kind, control.task, control.logs_hash) == ("random", "Toy-v0", "random")
     assert (control.observation_size, control.action_size) == (4, 3)
+    assert isinstance(control.network, Network)
     assert control.condition("none").shape == (0,)
     assert stats.kstest(control.probe_observations.reshape(-1), stats.norm.cdf).pvalue > 0.01
     assert stats.kstest(control.probe_actions.reshape(-1), stats.uniform(-1, 2).cdf).pvalue > 0.01

@@ -8,12 +8,13 @@ import safetensors.numpy
 from scipy.spatial import KDTree
 from truths import TwoModes
 
+from ppo_dap.dap.dataflow import trace
 from ppo_dap.errors import InputError
 from ppo_dap.logs import Logs
 from ppo_dap.prior_config import RetrievalConfig
 from ppo_dap.priors import fit_prior, load_prior
 from ppo_dap.priors import retrieval as module
-from ppo_dap.priors.network import Rows
+from ppo_dap.priors.network import Network, Rows, TrainedNetwork
 from ppo_dap.priors.retrieval import Memory
 from ppo_dap.priors.samplers import Solver
 
@@ -257,3 +258,26 @@ def test_returns_lead_to_the_episodes_that_had_them():
 def test_impossible_settings_are_refused(logs, options, message):
     with pytest.raises(InputError, match=message):
         fit_prior(logs, "retrieval", **options)
+
+
+def test_the_traced_program_shows_what_the_actions_depend_on():
+    """The proof by data flow reads the program: whatever is retrieved comes from arrays that it can see."""
+    rng = np.random.default_rng(0)
+    condition = np.ones((300, 2))
+    memory, _ = memory_of(states_of(rng, 300), condition, condition_on="return")
+    arrays = {name: getattr(memory, name) for name in ("keys", "actions", "observation_mean", "whitener")}
+
+    def sample(observations, condition, noise, **arrays):
+        actions, displacement = Memory(**arrays, config=memory.config).sample(observations, condition, noise, SOLVER)
+        return {"actions": actions, "displacement": displacement}
+
+    inputs = {"observations": jnp.zeros((3, 6)), "condition": jnp.ones((3, 2)), "noise": jnp.zeros((3, 4, 0))}
+    traced = trace(sample, {**inputs, **arrays})
+    flow = traced.flow()
+    assert flow.outputs == {"actions": {"observations", "condition", *arrays}, "displacement": set()}
+    assert "callback" not in str(traced.jaxpr)
+
+
+def test_a_memory_is_a_network_that_is_not_trained(prior):
+    assert isinstance(prior.network, Network)
+    assert not isinstance(prior.network, TrainedNetwork)

@@ -18,7 +18,7 @@ from ppo_dap.errors import InputError, TrainingDiverged, unknown
 from ppo_dap.logs.dataset import Logs
 from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 from ppo_dap.priors.kinds import NETWORKS
-from ppo_dap.priors.network import Network, Rows
+from ppo_dap.priors.network import Rows, TrainedNetwork
 from ppo_dap.priors.prior import Prior, asked_return, checked_bounds, scale_actions
 
 PROBE_ROWS = 256
@@ -53,8 +53,8 @@ class FitProgress(NamedTuple):
 class FitState(NamedTuple):
     """Everything that changes from step to step."""
 
-    network: Network
-    ema: Network
+    network: TrainedNetwork
+    ema: TrainedNetwork
     optimizer: Any
     step: Array
 

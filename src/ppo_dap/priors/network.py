@@ -32,18 +32,6 @@ class Network(Protocol):
     config: Any
     """Its settings, hashable."""
 
-    @staticmethod
-    def create(
-        rng: np.random.Generator,
-        config: Any,
-        observation_mean: Float[Array, " obs"],
-        observation_std: Float[Array, " obs"],
-        action_spread: Float[Array, ""],
-        action_size: int,
-    ) -> Network:
-        """A network before its fit, for logs with these moments (of all scaled actions together: their spread)."""
-        ...
-
     def noise_shape(self, solver: Solver, states: int, num: int) -> tuple[int, ...]:
         """Shape of the unit normal noise from which `num` actions for each of `states` are made."""
         ...
@@ -63,6 +51,23 @@ class Network(Protocol):
         """
         ...
 
+
+@runtime_checkable
+class TrainedNetwork(Network, Protocol):
+    """A family that is fitted by descent on a loss."""
+
+    @staticmethod
+    def create(
+        rng: np.random.Generator,
+        config: Any,
+        observation_mean: Float[Array, " obs"],
+        observation_std: Float[Array, " obs"],
+        action_spread: Float[Array, ""],
+        action_size: int,
+    ) -> TrainedNetwork:
+        """A network before its fit, for logs with these moments (of all scaled actions together: their spread)."""
+        ...
+
     def draw_loss(self, rng: np.random.Generator, *shape: int) -> Any:
         """The random numbers of `loss` over rows of `shape`, (*steps, n), as a pytree with these leading axes."""
         ...
@@ -79,8 +84,8 @@ class Network(Protocol):
         ...
 
 
-class BuiltNetwork(Protocol):
-    """A family that is made of its rows at once. It has these in place of `create`, `draw_loss` and `loss`."""
+class BuiltNetwork(Network, Protocol):
+    """A family that is made of its rows at once, with nothing to train; the random control has `blank` alone."""
 
     @staticmethod
     def build(train: Rows, held_out: Rows, config: Any, rng: np.random.Generator) -> tuple[Any, dict[str, Any]]:
