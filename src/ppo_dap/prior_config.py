@@ -14,8 +14,8 @@ CONDITIONS = {"none": 0, "return": 2}
 
 
 @dataclass(frozen=True)
-class FitConfig:
-    """What the fit of every trained prior has."""
+class FromLogs:
+    """What every prior that is made from logs has."""
 
     kind: ClassVar[str]
     rules: ClassVar[dict[str, Rule]] = {}
@@ -23,6 +23,24 @@ class FitConfig:
     condition_on: Literal["none", "return"] = "none"
     """What the prior can be asked for: nothing, or the return of the episode that an action comes from (then the logs
     need rewards)."""
+    validation_fraction: float = 0.1
+    """Share of the episodes that is held out."""
+
+    def __post_init__(self):
+        validate_fields(self, field_rules(type(self)))
+        if self.validation_fraction >= 1:
+            raise InputError(f"validation_fraction must be below 1, not {self.validation_fraction!r}")
+
+    @property
+    def num_conditions(self) -> int:
+        """Numbers beside the observation that the prior is conditioned on."""
+        return CONDITIONS[self.condition_on]
+
+
+@dataclass(frozen=True)
+class FitConfig(FromLogs):
+    """What the fit of every trained prior has."""
+
     condition_dropout: float = 0.2
     """Share of the rows whose condition is hidden in the fit, so that the prior can also be asked for nothing."""
     batch_size: int = 512
@@ -39,19 +57,11 @@ class FitConfig:
     """Looks at the held-out loss without a better one before the fit stops."""
     ema_decay: float = 0.999
     """Decay of the averaged weights, which are the ones that are validated and kept."""
-    validation_fraction: float = 0.1
-    """Share of the episodes that is held out."""
 
     def __post_init__(self):
-        validate_fields(self, field_rules(type(self)))
-        for name in ("validation_fraction", "ema_decay"):
-            if getattr(self, name) >= 1:
-                raise InputError(f"{name} must be below 1, not {getattr(self, name)!r}")
-
-    @property
-    def num_conditions(self) -> int:
-        """Numbers beside the observation that the prior is conditioned on."""
-        return CONDITIONS[self.condition_on]
+        super().__post_init__()
+        if self.ema_decay >= 1:
+            raise InputError(f"ema_decay must be below 1, not {self.ema_decay!r}")
 
 
 @dataclass(frozen=True)
@@ -86,8 +96,32 @@ class DiffusionConfig(FitConfig):
             raise InputError(f"sigma_min {self.sigma_min} must be below sigma_max {self.sigma_max}")
 
 
-PRIOR_CONFIGS: dict[str, Any] = {config.kind: config for config in (DiffusionConfig,)}
+@dataclass(frozen=True)
+class RetrievalConfig(FromLogs):
+    """Memory and distance of a retrieval prior."""
+
+    kind = "retrieval"
+    whitening: Literal["columns", "covariance"] = "columns"
+    """What makes distances in states comparable: each column's spread, or the covariance of all of them."""
+    return_weight: float = 1.0
+    """With condition_on 'return': what a standard deviation of the return counts in the distance, where one of a
+    state's column counts 1."""
+    max_rows: int = 100_000
+    """Most rows that are kept, drawn by the seed: a search compares each state with all of them."""
+
+
+@dataclass(frozen=True)
+class RandomConfig:
+    """The random control has no settings: it is made without logs and knows no condition."""
+
+    kind: ClassVar[str] = "random"
+    num_conditions: ClassVar[int] = 0
+
+
+PRIOR_CONFIGS: dict[str, Any] = {config.kind: config for config in (DiffusionConfig, RetrievalConfig, RandomConfig)}
 """Kind of prior -> its settings."""
+FITTED = tuple(kind for kind, config in PRIOR_CONFIGS.items() if issubclass(config, FromLogs))
+"""The kinds that are made from logs, which `fit_prior` takes."""
 
 
 def field_rules(config: type) -> dict[str, Rule]:

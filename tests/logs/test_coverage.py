@@ -5,7 +5,7 @@ import pytest
 
 from ppo_dap.errors import InputError
 from ppo_dap.logs import Logs, load_logs
-from ppo_dap.logs.coverage import SEGMENT, STRATA, cover, coverage_statistics
+from ppo_dap.logs.coverage import SEGMENT, STRATA, best_episodes, cover, coverage_statistics
 
 
 def ladder(episodes=50, length=20, seed=0):
@@ -118,3 +118,62 @@ def test_too_little_of_middling_return_is_refused():
     )
     with pytest.raises(InputError, match="middling return hold 104 rows of 2200"):
         cover(long, "narrow")
+
+
+def returning(returns, lengths):
+    """Episodes with these returns, all earned at a random row; row t's observation is (episode, t)."""
+    rng = np.random.default_rng(0)
+    rewards = [np.eye(length)[rng.integers(length)] * g for g, length in zip(returns, lengths, strict=True)]
+    rows = sum(lengths)
+    ends = np.isin(np.arange(rows), np.cumsum(lengths) - 1)
+    episode = np.repeat(np.arange(len(lengths)), lengths)
+    observations = np.stack([episode, np.arange(rows)], axis=1)
+    return Logs(observations, rng.normal(size=(rows, 2)), ends, rewards=np.concatenate(rewards))
+
+
+@pytest.mark.parametrize("share", [1e-6, 0.1, 0.33, 0.5, 0.8, 0.999])
+def test_the_best_episodes_are_the_fewest_of_highest_return_that_hold_the_share(share):
+    rng = np.random.default_rng(3)
+    lengths = rng.integers(1, 60, 40)
+    logs = returning(rng.normal(size=40) * 100, lengths)
+    best = best_episodes(logs, share)
+    # By hand: the next best, one at a time.
+    left, chosen, rows = list(range(40)), [], 0
+    totals = [float(logs.rewards[part].astype(np.float64).sum()) for part in logs.episode_slices()]
+    while rows < share * logs.num_rows:
+        chosen.append(max(left, key=lambda i: totals[i]))
+        left.remove(chosen[-1])
+        rows += int(lengths[chosen[-1]])
+    expected = np.concatenate([np.arange(logs.num_rows)[logs.episode_slices()[i]] for i in sorted(chosen)])
+    assert best.observations[:, 1].tolist() == expected.tolist()
+    assert best.actions.tolist() == logs.actions[expected].tolist()
+    assert best.episode_lengths().tolist() == [lengths[i] for i in sorted(chosen)]
+
+
+def test_ties_go_to_the_earlier_episode_and_whole_shares_are_met_exactly():
+    logs = returning([1.0, 2.0, 2.0, 2.0, 0.0], [20] * 5)
+    assert episodes_of(best_episodes(logs, 0.2)) == {1}
+    assert episodes_of(best_episodes(logs, 0.4)) == {1, 2}
+    assert episodes_of(best_episodes(logs, 0.6)) == {1, 2, 3}
+    assert episodes_of(best_episodes(logs, 0.61)) == {0, 1, 2, 3}
+    # 0.55 of 100 is above 55 in floating point, and must not cost another episode.
+    assert best_episodes(returning(range(20), [5] * 20), 0.55).num_episodes == 11
+
+
+def test_the_best_of_all_is_all():
+    logs = returning([3.0, 1.0], [4, 2])
+    assert best_episodes(logs, 1.0) is logs
+    assert best_episodes(logs, 0.9).hash() == logs.hash()
+
+
+@pytest.mark.parametrize("share", [0.0, -0.5, 1.5, float("nan")])
+def test_an_impossible_share_is_refused(share):
+    with pytest.raises(InputError, match=r"logs_filter is .*: must be above 0 and at most 1"):
+        best_episodes(ladder(), share)
+
+
+def test_logs_without_rewards_have_no_best():
+    logs = ladder()
+    with pytest.raises(InputError, match=r"memory has no rewards: use logs with rewards, or no filter") as caught:
+        best_episodes(Logs(logs.observations, logs.actions, logs.episode_ends), 0.5)
+    assert "\n" not in str(caught.value)

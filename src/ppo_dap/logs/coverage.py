@@ -1,4 +1,4 @@
-"""Coverage levels of 5.6: the same logs in full, thinned, and narrowed."""
+"""Coverage levels of 5.6: the same logs in full, thinned, and narrowed; and the best of them."""
 
 from __future__ import annotations
 
@@ -85,6 +85,25 @@ def _straying(logs: Logs) -> Float[np.ndarray, " rows"]:
     actions = logs.actions.astype(np.float64)
     spread = actions.std(0)
     return np.mean(np.square((actions - actions.mean(0)) / np.where(spread > 0, spread, 1.0)), axis=1)
+
+
+def best_episodes(logs: Logs, share: float) -> Logs:
+    """Whole episodes, the best by undiscounted return first, until they hold at least `share` of the rows; ties go to
+    the earlier one. They stay in the logs' order, and share 1 is all of them.
+
+    Raises `InputError` unless 0 < share <= 1, and for a share below 1 of logs without rewards.
+    """
+    if not 0 < share <= 1:
+        raise InputError(f"logs_filter is {share}: must be above 0 and at most 1, the share of rows to keep")
+    if share == 1:
+        return logs
+    returns = logs.episode_returns()
+    if returns is None:
+        found = f"goes by returns, and {logs.source} has no rewards"
+        raise InputError(f"logs_filter {share} {found}: use logs with rewards, or no filter")
+    order = np.argsort(-returns, kind="stable")
+    kept = np.cumsum(logs.episode_lengths()[order]) / logs.num_rows
+    return logs.select(np.sort(order[: 1 + int(np.argmax(kept >= share))]))
 
 
 def coverage_statistics(logs: Logs) -> dict[str, float]:

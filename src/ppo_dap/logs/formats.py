@@ -4,6 +4,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ppo_dap.errors import InputError
 from ppo_dap.logs.columns import Columns
 from ppo_dap.logs.dataset import Logs
@@ -14,6 +16,9 @@ from ppo_dap.logs.npz import read_npz
 from ppo_dap.logs.sampling import MAX_BYTES, Budget
 from ppo_dap.logs.tables import read_csv, read_parquet
 
+SHUFFLED = "shuffled:"
+SHUFFLE_STREAM = 5
+"""Keeps the permutation apart from other draws by the same seed."""
 SAMPLES = Path(__file__).parent / "samples"
 HDF5_SUFFIXES = (".hdf5", ".h5")
 TABLES = {".csv": read_csv, ".parquet": read_parquet}
@@ -40,10 +45,13 @@ def load_logs(
     """Read logged trajectories; only states and actions are required of them.
 
     `source` is, in this order: an existing path (a `.npz` file, a `.hdf5` or `.h5` file in D4RL layout, a `.csv` or
-    `.parquet` table, the folder of a Minari or LeRobot dataset), the name of a shipped sample, or a Minari id in the
-    local Minari root (nothing is downloaded). `task`, a Gymnasium id, replaces the task that the file names.
-    `columns` says which columns of a table mean what, where their names do not: see `ppo_dap.logs.columns`. Nothing is
-    unpickled and no code is run.
+    `.parquet` table, the folder of a Minari or LeRobot dataset), `shuffled:` and a source, the name of a shipped
+    sample, or a Minari id in the local Minari root (nothing is downloaded). `task`, a Gymnasium id, replaces the task
+    that the file names. `columns` says which columns of a table mean what, where their names do not: see
+    `ppo_dap.logs.columns`. Nothing is unpickled and no code is run.
+
+    `shuffled:` is a control: the source's rows with their actions permuted among all of them by `seed`, so that a state
+    says nothing about its action.
 
     Files are read in pieces. Rows of more than `max_bytes` (as float32, in memory) are not all kept, but whole
     episodes, drawn uniformly by `seed`; `Logs.drawn` says how many.
@@ -64,6 +72,8 @@ def _read(source: str | os.PathLike, columns: Columns | None, budget: Budget) ->
         if columns and path.suffix not in TABLES and not is_lerobot_folder(path):
             raise InputError(f"{path}: columns is given: must be left out but for tables and LeRobot datasets")
         return _read_path(path, columns, budget)
+    if name.startswith(SHUFFLED):
+        return shuffle_actions(_read(name.removeprefix(SHUFFLED), columns, budget), budget.seed)
     if name in sample_names():
         return replace(read_npz(SAMPLES / f"{name}.npz", budget), source=name)
     if path.suffix in SUFFIXES:
@@ -71,6 +81,14 @@ def _read(source: str | os.PathLike, columns: Columns | None, budget: Budget) ->
     if DATASET_ID.fullmatch(name):
         return read_minari_id(name, budget)
     raise InputError(f"unknown logs {name!r}: {_choices()}")
+
+
+def shuffle_actions(logs: Logs, seed: int) -> Logs:
+    """The logs with the rows' actions permuted among all rows by `seed`: each column keeps its values, and which state
+    they belong to is gone.
+    """
+    order = np.random.default_rng([seed, SHUFFLE_STREAM]).permutation(logs.num_rows)
+    return replace(logs, actions=logs.actions[order], source=f"{SHUFFLED}{logs.source}")
 
 
 def _choices() -> str:

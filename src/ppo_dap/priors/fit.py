@@ -16,10 +16,10 @@ from jaxtyping import Array, Float, Int
 
 from ppo_dap.errors import InputError, TrainingDiverged, unknown
 from ppo_dap.logs.dataset import Logs
-from ppo_dap.prior_config import PRIOR_CONFIGS
+from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 from ppo_dap.priors.kinds import NETWORKS
-from ppo_dap.priors.network import Network
-from ppo_dap.priors.prior import Prior, asked_return, scale_actions
+from ppo_dap.priors.network import Rows, TrainedNetwork
+from ppo_dap.priors.prior import Prior, asked_return, checked_bounds, scale_actions
 
 PROBE_ROWS = 256
 VALIDATION_ROWS = 8192
@@ -29,14 +29,6 @@ ASKED_SHARE = 0.95
 """Who asks for the top return asks for this quantile of the logged ones."""
 FIT_STREAM = 3
 """Keeps the fit's random numbers apart from those of the split of episodes."""
-
-
-class Rows(NamedTuple):
-    """Rows to fit to, with scaled actions."""
-
-    observations: Float[Array, "rows obs"]
-    condition: Float[Array, "rows c"]
-    actions: Float[Array, "rows act"]
 
 
 class Draws(NamedTuple):
@@ -61,8 +53,8 @@ class FitProgress(NamedTuple):
 class FitState(NamedTuple):
     """Everything that changes from step to step."""
 
-    network: Network
-    ema: Network
+    network: TrainedNetwork
+    ema: TrainedNetwork
     optimizer: Any
     step: Array
 
@@ -78,9 +70,9 @@ def fit_prior(
     Options are the fields of the kind's config (`DiffusionConfig` and so on), and `action_low` and `action_high` for
     logs that do not carry the action space's bounds, or carry infinite ones.
     """
-    config_class = PRIOR_CONFIGS.get(kind)
-    if config_class is None:
-        raise unknown("prior kind", kind, PRIOR_CONFIGS)
+    if kind not in FITTED:
+        raise unknown("prior kind", kind, FITTED)
+    config_class = PRIOR_CONFIGS[kind]
     low, high, options = _bounds(logs, options)
     known = [f.name for f in dataclasses.fields(config_class)]
     for name in options:
@@ -114,14 +106,7 @@ def _bounds(logs: Logs, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     low, high = logs.action_low if low is None else low, logs.action_high if high is None else high
     if low is None or high is None:
         raise InputError("these logs carry no action bounds: pass action_low and action_high")
-    size = logs.actions.shape[1]
-    try:
-        bounds = [np.broadcast_to(np.asarray(bound, np.float32), (size,)).copy() for bound in (low, high)]
-    except ValueError:
-        raise InputError(f"action_low {low} and action_high {high} must be a number or {size} numbers") from None
-    if not (np.all(np.isfinite(bounds)) and np.all(bounds[0] <= bounds[1])):
-        raise InputError(f"action_low {low} and action_high {high} must be finite, low <= high")
-    return bounds[0], bounds[1], rest
+    return *checked_bounds(low, high, logs.actions.shape[1]), rest
 
 
 def return_conditions(logs: Logs) -> dict[str, float]:
@@ -156,9 +141,11 @@ def train_network(
 ) -> tuple[Any, dict[str, Any]]:
     """Minimise the network's loss on `train`; returns the averaged weights that were best on `held_out`, and a summary.
 
-    Of Eq. 6, for the diffusion prior.
+    Of Eq. 6, for the diffusion prior. A network that is built has nothing to minimise and is built of `train`.
     """
     rng = np.random.default_rng([seed, FIT_STREAM])
+    if hasattr(network_class, "build"):
+        return network_class.build(train, held_out, config, rng)
     state = init_state(network_class, train, config, rng)
     # A fixed random subset, in random order and with the same noise at every look: looks differ by the weights alone.
     picked = rng.permutation(held_out.actions.shape[0])[:VALIDATION_ROWS]

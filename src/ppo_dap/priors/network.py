@@ -7,13 +7,22 @@ logs. A condition of zeros asks for nothing in particular.
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from ppo_dap.nets.adapters import Adapters
 from ppo_dap.priors.samplers import Field, Solver
+
+
+class Rows(NamedTuple):
+    """Rows to fit to, with scaled actions."""
+
+    observations: Float[Array, "rows obs"]
+    condition: Float[Array, "rows c"]
+    actions: Float[Array, "rows act"]
 
 
 @runtime_checkable
@@ -34,18 +43,6 @@ class Network(Protocol):
     config: Any
     """Its settings, hashable."""
 
-    @staticmethod
-    def create(
-        rng: np.random.Generator,
-        config: Any,
-        observation_mean: Float[Array, " obs"],
-        observation_std: Float[Array, " obs"],
-        action_spread: Float[Array, ""],
-        action_size: int,
-    ) -> Network:
-        """A network before its fit, for logs with these moments (of all scaled actions together: their spread)."""
-        ...
-
     def noise_shape(self, solver: Solver, states: int, num: int) -> tuple[int, ...]:
         """Shape of the unit normal noise from which `num` actions for each of `states` are made."""
         ...
@@ -65,6 +62,23 @@ class Network(Protocol):
         """
         ...
 
+
+@runtime_checkable
+class TrainedNetwork(Network, Protocol):
+    """A family that is fitted by descent on a loss."""
+
+    @staticmethod
+    def create(
+        rng: np.random.Generator,
+        config: Any,
+        observation_mean: Float[Array, " obs"],
+        observation_std: Float[Array, " obs"],
+        action_spread: Float[Array, ""],
+        action_size: int,
+    ) -> TrainedNetwork:
+        """A network before its fit, for logs with these moments (of all scaled actions together: their spread)."""
+        ...
+
     def draw_loss(self, rng: np.random.Generator, *shape: int) -> Any:
         """The random numbers of `loss` over rows of `shape`, (*steps, n), as a pytree with these leading axes."""
         ...
@@ -78,4 +92,18 @@ class Network(Protocol):
         adapters: Adapters | None = None,
     ) -> Float[Array, ""]:
         """What the fit minimises."""
+        ...
+
+
+class BuiltNetwork(Network, Protocol):
+    """A family that is made of its rows at once, with nothing to train; the random control has `blank` alone."""
+
+    @staticmethod
+    def build(train: Rows, held_out: Rows, config: Any, rng: np.random.Generator) -> tuple[Any, dict[str, Any]]:
+        """The network, and a summary with `rows`, `steps` (0), `validation_loss` and whatever else there is to say."""
+        ...
+
+    @staticmethod
+    def blank(config: Any, tensors: Mapping[str, np.ndarray]) -> Any:
+        """The shapes of a saved one, for reading it from the `tensors` of its prior's file."""
         ...

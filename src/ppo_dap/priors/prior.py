@@ -37,6 +37,17 @@ def scale_actions(actions: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
     return scaled.astype(np.float32)
 
 
+def checked_bounds(low: Any, high: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of `size` actions, given as a number or as `size` numbers each; raises `InputError` for others."""
+    try:
+        bounds = [np.broadcast_to(np.asarray(bound, np.float32), (size,)).copy() for bound in (low, high)]
+    except ValueError:
+        raise InputError(f"action_low {low} and action_high {high} must be a number or {size} numbers") from None
+    if not (np.all(np.isfinite(bounds)) and np.all(bounds[0] <= bounds[1])):
+        raise InputError(f"action_low {low} and action_high {high} must be finite, low <= high")
+    return bounds[0], bounds[1]
+
+
 def unscale_actions(
     scaled: Float[Array, "*batch act"], low: Float[np.ndarray, " act"], high: Float[np.ndarray, " act"]
 ) -> Float[Array, "*batch act"]:
@@ -167,6 +178,8 @@ def load_prior(path: str | Path) -> Prior:
 
 
 def _read_network(network_class: Any, config: Any, tensors: dict[str, np.ndarray], source: object) -> Any:
+    if hasattr(network_class, "blank"):
+        return tree_from_tensors(network_class.blank(config, tensors), tensors, "network", source)
     moments = [jax.ShapeDtypeStruct((tensors["probe_observations"].shape[1],), jnp.float32)] * 2
     spread, action_size = jax.ShapeDtypeStruct((), jnp.float32), tensors["action_low"].shape[0]
     blank = jax.eval_shape(
