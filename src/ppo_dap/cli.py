@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 from ppo_dap import commands
 from ppo_dap import config as configs
 from ppo_dap.errors import InputError, PPODAPError, unknown
-from ppo_dap.prior_config import PRIOR_CONFIGS
+from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 
 
 class Parser(argparse.ArgumentParser):
@@ -108,7 +108,7 @@ def _from_logs_to_runs(command: Command) -> None:
         text = f"{bound}est action, a number or one for each action (default: the task's, or as the logs say)"
         sub.add_argument(f"--action-{bound}", nargs="+", type=float, metavar="X", help=text)
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
-    sub.add_argument("--kind", default="diffusion", help=f"{', '.join(PRIOR_CONFIGS)} (default: %(default)s)")
+    sub.add_argument("--kind", default="diffusion", help=f"{', '.join(FITTED)} (default: %(default)s)")
     _filter_option(sub)
     sub.add_argument("--coverage", default="wide", help="wide, medium or narrow: how much of the logs (default: wide)")
     sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit, and of the coverage (default: 0)")
@@ -267,12 +267,12 @@ def _config_options(parser: Parser) -> None:
 
 def _prior_options(parser: Parser) -> None:
     """A flag for every field of every kind of prior; those that several kinds have are there once."""
-    kinds: dict[str, list[str]] = {}
-    for kind, cls in PRIOR_CONFIGS.items():
+    fitted, kinds = {kind: PRIOR_CONFIGS[kind] for kind in FITTED}, {}
+    for kind, cls in fitted.items():
         for f in dataclasses.fields(cls):
             kinds.setdefault(f.name, []).append(kind)
     seen: set[str] = set()
-    for kind, cls in PRIOR_CONFIGS.items():
+    for kind, cls in fitted.items():
         section = parser.add_argument_group(f"{kind} prior: {(cls.__doc__ or '').splitlines()[0]}")
         _field_options(section, cls, {name: others for name, others in kinds.items() if name not in seen})
         seen |= {f.name for f in dataclasses.fields(cls)}

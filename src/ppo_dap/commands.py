@@ -14,7 +14,7 @@ from typing import Any
 
 from ppo_dap import config as configs
 from ppo_dap.errors import InputError, unknown
-from ppo_dap.prior_config import PRIOR_CONFIGS
+from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 from ppo_dap.training.manifest import prepare_jax
 
 
@@ -109,10 +109,10 @@ def pretrain(options: argparse.Namespace) -> int:
 
 def _prior_options(options: argparse.Namespace) -> dict[str, Any]:
     """The given fields of the kind's settings; a bad one is told before JAX is imported."""
-    config = PRIOR_CONFIGS.get(options.kind)
-    if config is None:
-        raise unknown("kind", options.kind, PRIOR_CONFIGS)
-    every = {f.name for other in PRIOR_CONFIGS.values() for f in dataclasses.fields(other)}
+    if options.kind not in FITTED:
+        raise unknown("kind", options.kind, FITTED)
+    config = PRIOR_CONFIGS[options.kind]
+    every = {f.name for kind in FITTED for f in dataclasses.fields(PRIOR_CONFIGS[kind])}
     given = {name: getattr(options, name) for name in sorted(every) if name in options}
     own = {f.name for f in dataclasses.fields(config)}
     for name in given:

@@ -118,7 +118,54 @@ class RandomConfig:
     num_conditions: ClassVar[int] = 0
 
 
-PRIOR_CONFIGS: dict[str, Any] = {config.kind: config for config in (DiffusionConfig, RetrievalConfig, RandomConfig)}
+@dataclass(frozen=True)
+class BehaviourConfig(FitConfig):
+    """A cloned Gaussian policy: the prior of "PPO + Behavior-prior KL" in Table 3."""
+
+    kind = "behaviour"
+    rules: ClassVar[dict[str, Rule]] = {"log_std_floor": (lambda v: v < 0, "a number below 0")}
+    learning_rate: float = 2e-3
+    """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
+    width: int = 128
+    """Units of the two hidden layers."""
+    log_std_floor: float = -2.0
+    """What the log standard deviation stays above: as the clone's spread goes to 0, the KL to it goes to infinity."""
+
+
+@dataclass(frozen=True)
+class FlowConfig(FitConfig):
+    """A conditional normalising flow: the prior of "PPO + Flow-prior" in Table 3."""
+
+    kind = "flow"
+    learning_rate: float = 2e-3
+    """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
+    couplings: int = 4
+    """Affine couplings between the noise and the action."""
+    width: int = 64
+    """Units of the two layers of a coupling that see the action."""
+    state_width: int = 128
+    """Units of the two layers that see the state, once for all actions and couplings."""
+    dequantization: float = 0.005
+    """Half-width of the uniform noise that the fit adds, in scaled actions, to give actions at a bound a density."""
+
+
+@dataclass(frozen=True)
+class VAEConfig(FitConfig):
+    """A conditional variational autoencoder: the prior of "VAE + PPO (ctrl)" in Table 7."""
+
+    kind = "vae"
+    learning_rate: float = 1e-3
+    """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
+    width: int = 256
+    """Units of the two hidden layers of the encoder and of the decoder."""
+    latents_per_action: int = 2
+    """Numbers of the latent code for each action dimension."""
+    kl_weight: float = 0.5
+    """Weight of the mean KL of a latent number beside the mean squared error of an action dimension (BCQ's)."""
+
+
+_KINDS = (DiffusionConfig, BehaviourConfig, FlowConfig, VAEConfig, RetrievalConfig, RandomConfig)
+PRIOR_CONFIGS: dict[str, Any] = {config.kind: config for config in _KINDS}
 """Kind of prior -> its settings."""
 FITTED = tuple(kind for kind, config in PRIOR_CONFIGS.items() if issubclass(config, FromLogs))
 """The kinds that are made from logs, which `fit_prior` takes."""

@@ -1,3 +1,4 @@
+import functools
 import sys
 from pathlib import Path
 
@@ -10,11 +11,18 @@ sys.path.insert(0, str(Path(__file__).parent))  # for `truths`
 from truths import TwoModes
 
 from ppo_dap.logs import Logs
-from ppo_dap.prior_config import DiffusionConfig
-from ppo_dap.priors.diffusion import Denoiser
+from ppo_dap.prior_config import PRIOR_CONFIGS
 from ppo_dap.priors.fit import Rows, fit_prior, train_network
+from ppo_dap.priors.kinds import NETWORKS
 
-SMALL = {"width": 64, "depth": 1, "batch_size": 256, "max_steps": 1500, "chunk_steps": 250, "ema_decay": 0.99}
+FIT = {"batch_size": 256, "max_steps": 1500, "chunk_steps": 250, "ema_decay": 0.99}
+SMALL = {
+    "diffusion": {**FIT, "width": 64},
+    "behaviour": {**FIT, "width": 32, "max_steps": 1000},
+    "flow": {**FIT, "width": 32, "state_width": 32, "learning_rate": 5e-3},
+    "vae": {**FIT, "width": 64, "max_steps": 1000, "learning_rate": 3e-3},
+}
+"""Options of a fit that takes seconds, a kind each."""
 
 
 def two_mode_logs(rows=20_000):
@@ -34,18 +42,35 @@ def logs():
 
 
 @pytest.fixture(scope="session")
-def prior(logs):
-    return fit_prior(logs, seed=3, **SMALL)
+def small():
+    return SMALL
 
 
 @pytest.fixture(scope="session")
-def labelled():
-    """A denoiser fitted to actions near -0.5 under the label -1 and near 0.5 under the label 1."""
+def fitted(logs):
+    """The prior of a kind, fitted to `logs` once."""
+    return functools.cache(lambda kind: fit_prior(logs, kind, seed=3, **SMALL[kind]))
+
+
+@pytest.fixture(scope="session")
+def prior(fitted):
+    return fitted("diffusion")
+
+
+@pytest.fixture(params=list(PRIOR_CONFIGS))
+def every_prior(request, fitted):
+    return fitted(request.param)
+
+
+@pytest.fixture(params=list(PRIOR_CONFIGS))
+def labelled(request):
+    """A network of each kind, fitted to actions near -0.5 under the label -1 and near 0.5 under the label 1."""
     rng = np.random.default_rng(1)
     label = rng.choice([-1.0, 1.0], (8000, 1))
     actions = 0.5 * label + 0.1 * rng.standard_normal((8000, 1))
     condition = np.concatenate([label, np.ones_like(label)], axis=1)
     rows = Rows(*(jnp.asarray(a, jnp.float32) for a in (rng.standard_normal((8000, 2)), condition, actions)))
-    config = DiffusionConfig(**{**SMALL, "width": 32, "max_steps": 600, "chunk_steps": 200}, condition_on="return")
+    options = {**SMALL[request.param], "width": 32, "max_steps": 600, "chunk_steps": 200}
+    config = PRIOR_CONFIGS[request.param](**options, condition_on="return")
     held_out = Rows(*(a[7000:] for a in rows))
-    return train_network(Denoiser, Rows(*(a[:7000] for a in rows)), held_out, config, 0)[0]
+    return train_network(NETWORKS[request.param], Rows(*(a[:7000] for a in rows)), held_out, config, 0)[0]

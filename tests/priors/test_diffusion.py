@@ -19,7 +19,6 @@ from ppo_dap.priors.diffusion import (
     spread_sigmas,
 )
 from ppo_dap.priors.fit import Rows, train_network
-from ppo_dap.priors.samplers import Solver
 
 SD = 0.2
 
@@ -162,20 +161,6 @@ def test_moments_of_the_logs_do_not_move(gaussian_fit):
     assert not np.any(gradient.observation_mean)
     assert not np.any(gradient.observation_std)
     assert np.any(gradient.out.weight)
-
-
-def test_condition_conditions(labelled):
-    solver = Solver("ancestral", 20)
-    noise = jax.random.normal(jax.random.key(0), labelled.noise_shape(solver, 50, 20))
-    for label in (-1.0, 1.0):
-        condition = jnp.asarray(np.tile([label, 1.0], (50, 1)), jnp.float32)
-        actions, _ = labelled.sample(jnp.zeros((50, 2)), condition, noise, solver)
-        assert float(jnp.mean(actions)) == pytest.approx(0.5 * label, abs=0.03)
-        assert float(jnp.std(actions)) == pytest.approx(0.1, abs=0.03)
-    # Asked for nothing it gives what both labels give together.
-    actions, _ = labelled.sample(jnp.zeros((50, 2)), jnp.zeros((50, 2)), noise, solver)
-    assert float(jnp.mean(actions > 0)) == pytest.approx(0.5, abs=0.08)
-    assert float(jnp.std(actions)) > 0.35  # each alone: 0.1
 
 
 @pytest.mark.parametrize(

@@ -27,22 +27,22 @@ def rewritten(path, header=None, drop=None, **changes):
     return path
 
 
-def test_a_loaded_prior_is_the_same_prior(prior, tmp_path):
-    loaded = load_prior(saved(prior, tmp_path))
+def test_a_loaded_prior_is_the_same_prior(every_prior, tmp_path):
+    loaded = load_prior(saved(every_prior, tmp_path))
     assert isinstance(loaded, Prior)
     states = np.random.default_rng(0).standard_normal((7, 2))
     np.testing.assert_array_equal(
-        loaded.sample(states, jax.random.key(1), 5), prior.sample(states, jax.random.key(1), 5)
+        loaded.sample(states, jax.random.key(1), 5), every_prior.sample(states, jax.random.key(1), 5)
     )
-    for field in dataclasses.fields(prior):
+    for field in dataclasses.fields(every_prior):
         if field.name != "network":
-            np.testing.assert_equal(getattr(loaded, field.name), getattr(prior, field.name))
+            np.testing.assert_equal(getattr(loaded, field.name), getattr(every_prior, field.name))
 
 
-def test_save_writes_exactly_the_path_and_nothing_else(prior, tmp_path):
-    path = saved(prior, tmp_path / "new" / "folder")
+def test_save_writes_exactly_the_path_and_nothing_else(every_prior, tmp_path):
+    path = saved(every_prior, tmp_path / "new" / "folder")
     first = path.read_bytes()
-    prior.save(str(path))
+    every_prior.save(str(path))
     assert path.read_bytes() == first
     assert [p.name for p in path.parent.iterdir()] == ["prior"]
 
@@ -100,6 +100,12 @@ def test_older_format(prior, tmp_path):
 def test_missing_or_misshapen_arrays(prior, tmp_path):
     refuse(rewritten(saved(prior, tmp_path), drop="network.out.weight"), "nothing for network.out.weight")
     refuse(rewritten(saved(prior, tmp_path), drop="action_low"), "action_low is missing")
+
+
+def test_another_kinds_arrays_are_refused(prior, tmp_path):
+    refuse(
+        rewritten(saved(prior, tmp_path), prior="flow", config={}), "nothing for network.state_net|where .* is needed"
+    )
 
 
 def test_unreadable_header(prior, tmp_path):

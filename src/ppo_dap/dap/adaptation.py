@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import equinox as eqx
 import jax
@@ -13,13 +13,18 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import AdaptationConfig
-from ppo_dap.nets.adapters import Adapters
-from ppo_dap.priors.network import Network
+from ppo_dap.nets.adapters import Adapters, Backbone
+from ppo_dap.priors.network import TrainedNetwork
 
 Provenance = Callable[[Int[Array, " n"], Float[Array, "n obs"]], Float[Array, " n"]]
 """(state_ids, raw states) -> 1 for each that is a row of D_on, else 0."""
 
 ADAM: Any = optax.scale_by_adam(eps=1e-8)
+
+
+def is_tuned(prior: Any, config: AdaptationConfig) -> TypeGuard[TrainedNetwork]:
+    """Whether PET tunes this prior: it has hidden layers for adapters, and the frequency is not 0."""
+    return config.pet_frequency > 0 and isinstance(prior, Backbone)
 
 
 class PETData(eqx.Module):
@@ -41,7 +46,7 @@ class PETDraws(NamedTuple):
     """As the prior draws them."""
 
     @staticmethod
-    def make(rng: np.random.Generator, prior: Network, actor_updates: int, config: AdaptationConfig):
+    def make(rng: np.random.Generator, prior: TrainedNetwork, actor_updates: int, config: AdaptationConfig):
         """Draws for an iteration of `actor_updates`."""
         most = max(1, -(-config.pet_frequency * actor_updates // 100))  # a loop of no steps is traced all the same
         size = (most, config.pet_minibatch_size)
@@ -54,7 +59,7 @@ def steps_until(iteration: int, pet_frequency: int, actor_updates: int) -> int:
 
 
 def adapt(
-    prior: Network,
+    prior: TrainedNetwork,
     adapters: Adapters,
     optimizer: optax.OptState,
     rows: PETData,

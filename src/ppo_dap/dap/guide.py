@@ -22,7 +22,7 @@ from ppo_dap.nets.actor import Actor
 from ppo_dap.nets.adapters import Adapters, Backbone, adapter_norm, init_adapters
 from ppo_dap.nets.critic import Critic, QFunction, q_features
 from ppo_dap.ppo.update import Rows
-from ppo_dap.priors.network import Network
+from ppo_dap.priors.network import Network, TrainedNetwork
 
 Q_SPREAD_DECAY = 0.9
 """Memory of the running global scale of Q, an iteration each."""
@@ -121,11 +121,11 @@ def create_guide(
     rng: np.random.Generator, critic: Critic | None, sizes: tuple[int, int], config: Config, prior: Network
 ) -> GuideState:
     """A fresh Q and identity adapters for (observation, action) `sizes`; Q reads `critic`'s trunk."""
-    own_trunk, adaptation_ = config.q.q_trunk == "separate", config.adaptation
+    own_trunk = config.q.q_trunk == "separate"
     q = QFunction.create(rng, *sizes, config.ppo.hidden_size, config.q.q_hidden_size, own_trunk, config.q.q_heads)
     adapters = None
-    if adaptation_.pet_frequency and isinstance(prior, Backbone):
-        adapters = init_adapters(rng, prior, adaptation_.adapter, adaptation_.adapter_rank)
+    if adaptation.is_tuned(prior, config.adaptation) and isinstance(prior, Backbone):
+        adapters = init_adapters(rng, prior, config.adaptation.adapter, config.adaptation.adapter_rank)
     blank = Judged(*jnp.asarray(np.zeros((3, config.ppo.rollout_steps), np.float32)))
     return GuideState(
         q,
@@ -241,7 +241,7 @@ def learn_q(
 
 def adapt_prior(
     guide: GuideState,
-    prior: Network,
+    prior: TrainedNetwork,
     rows: OnPolicy,
     batch: Batch,
     num_steps: Int[Array, ""],

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from ppo_dap import config as configs
-from ppo_dap.dap.adaptation import PETDraws, steps_until
+from ppo_dap.dap.adaptation import PETDraws, is_tuned, steps_until
 from ppo_dap.dap.guidance import beta_schedule
 from ppo_dap.dap.guide import (
     GuideState,
@@ -105,7 +105,7 @@ class Guide:
         gated, spread, of_proposals = self._gate(state, [proposed], batch)
         learned = self._learn_q(state, None, None, rows, draw_orders(rng, self.config.q.q_epochs, n))
         adapters, optimizer, adapted = state.adapters, state.pet_optimizer, {}
-        if adapters is not None:
+        if adapters is not None and is_tuned(network, self.config.adaptation):
             frequency = self.config.adaptation.pet_frequency
             due = [steps_until(i, frequency, updates) for i in (self.iteration, self.iteration + 1)]
             pet = PETDraws.make(rng, network, updates, self.config.adaptation)

@@ -2,5 +2,6 @@
 
 from ppo_dap.priors.fit import fit_prior
 from ppo_dap.priors.prior import Prior, load_prior
+from ppo_dap.priors.random import random_prior
 
-__all__ = ["Prior", "fit_prior", "load_prior"]
+__all__ = ["Prior", "fit_prior", "load_prior", "random_prior"]

@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 from ppo_dap.nets.adapters import Adapters, apply_hidden, merge
 from ppo_dap.nets.mlp import MLP, Linear, silu
 from ppo_dap.prior_config import DiffusionConfig
+from ppo_dap.priors.network import network_inputs
 from ppo_dap.priors.samplers import SAMPLERS, Field, Solver, centred_start, karras_sigmas
 
 NOISE_FREQUENCIES = 8
-OBSERVATION_CLIP = 10.0
 
 
 class Denoiser(eqx.Module):
@@ -103,11 +103,7 @@ class Denoiser(eqx.Module):
         self, observations: Float[Array, "n obs"], condition: Float[Array, "n c"]
     ) -> Float[Array, "n conditioned"]:
         """What F needs to know about the state: computed once a state, used at every step of all its k actions."""
-        mean, std = jax.lax.stop_gradient((self.observation_mean, self.observation_std))
-        shape = observations.shape
-        normalised = (observations - jnp.broadcast_to(mean, shape)) / jnp.broadcast_to(std, shape)
-        clipped = jnp.clip(normalised, -OBSERVATION_CLIP, OBSERVATION_CLIP)
-        return self.state_net(jnp.concatenate([clipped, condition], axis=-1))
+        return self.state_net(network_inputs(observations, condition, self.observation_mean, self.observation_std))
 
     def __call__(
         self,

@@ -10,11 +10,31 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ppo_dap.nets.adapters import Adapters
 from ppo_dap.priors.samplers import Field, Solver
+
+OBSERVATION_CLIP = 10.0
+
+
+def network_inputs(
+    observations: Float[Array, "n obs"],
+    condition: Float[Array, "n c"],
+    mean: Float[Array, " obs"],
+    std: Float[Array, " obs"],
+) -> Float[Array, "n inputs"]:
+    """What a network sees of the state: the observation in the logs' standard deviations, clipped, and the condition.
+
+    No gradient enters the moments, which are those of the logs and stay so.
+    """
+    mean, std = jax.lax.stop_gradient((mean, std))
+    shape = observations.shape
+    normalised = (observations - jnp.broadcast_to(mean, shape)) / jnp.broadcast_to(std, shape)
+    return jnp.concatenate([jnp.clip(normalised, -OBSERVATION_CLIP, OBSERVATION_CLIP), condition], axis=-1)
 
 
 class Rows(NamedTuple):

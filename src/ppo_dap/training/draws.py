@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import Int
 
 from ppo_dap.config import Config
-from ppo_dap.dap.adaptation import PETDraws
+from ppo_dap.dap.adaptation import PETDraws, is_tuned
 from ppo_dap.dap.audit import PROXY_SOLVER, PROXY_STATES
 from ppo_dap.dap.guide import num_proposal_states
 from ppo_dap.dap.proposals import ProposalDraws
-from ppo_dap.nets.adapters import Backbone
 from ppo_dap.ppo.update import Orders, draw_orders
 from ppo_dap.priors.network import Network
 
@@ -53,13 +52,12 @@ def draw(config: Config, iteration: int, prior: Network | None) -> Draws:
     parts = num_parts(config)
     states = num_proposal_states(rows, parts, config)
     few, k = min(PROXY_STATES, states), config.proposals.num_proposals
-    adapted = config.adaptation.pet_frequency > 0 and isinstance(prior, Backbone)
     updates = ppo.num_epochs * rows // ppo.minibatch_size
     return Draws(
         Orders(actor, draw_orders(rng, ppo.num_epochs, states)),  # type: ignore[arg-type]
         critic,
         tuple(ProposalDraws.make(rng, rows // parts, states // parts, prior, config.proposals) for _ in range(parts)),
         draw_orders(rng, config.q.q_epochs, rows),
-        PETDraws.make(rng, prior, updates, config.adaptation) if adapted else (),
+        PETDraws.make(rng, prior, updates, config.adaptation) if is_tuned(prior, config.adaptation) else (),
         rng.standard_normal(prior.noise_shape(PROXY_SOLVER, few, k), dtype=np.float32),
     )
