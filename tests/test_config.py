@@ -138,17 +138,31 @@ def test_wrong_types_are_refused_by_name(name):
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_negative_numbers_are_refused_by_name(name):
-    text = refused(**{name: -1})
+    negative = -2 if name == "clip_slope" else -1
+    text = refused(**{name: negative})
     assert text.startswith(f"{name} must be a number")
-    assert text.endswith("not -1")
+    assert text.endswith(f"not {negative}")
+
+
+def test_a_clips_slope_is_from_minus_1_to_1():
+    for slope in (-1, -0.3, 0, 1):
+        validate(planted(clip_slope=slope))
+    for slope in (-1.01, 1.01):
+        assert refused(clip_slope=slope) == f"clip_slope must be a number from -1 to 1, not {slope}"
+
+
+def test_at_most_one_batch_is_reused():
+    assert replace(Config(), reuse_batches=1).ppo.reuse_batches == 1
+    assert refused(reuse_batches=2) == "reuse_batches must be a number from 0 to 1, not 2"
 
 
 AT_LEAST_0 = {"value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every"}
+AT_LEAST_0 |= {"contest_kl_weight"}
 
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_zero_is_refused_where_it_cannot_work(name):
-    if name in AT_LEAST_0 | {"seed", "gamma", "gae_lambda"}:
+    if name in AT_LEAST_0 | {"seed", "gamma", "gae_lambda", "clip_slope", "reuse_batches"}:
         validate(planted(**{name: 0}))
     else:
         assert name in refused(**{name: 0})

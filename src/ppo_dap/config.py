@@ -51,6 +51,18 @@ class PPOConfig:
     """Normalised observations are clipped to this many standard deviations."""
     reward_clip: float = 10.0
     """Scaled rewards are clipped to this absolute value."""
+    surrogate: Literal["clip", "authentic_boundary", "generalised_clip"] = "clip"
+    """Objective of the actor: Eq. 5, or the reconstructions of ABPPO's and of PPO-GC's (ppo/surrogate.py)."""
+    clip_slope: float = 0.1
+    """alpha: slope of the generalised clip outside the clip range; 0 is Eq. 5, 1 does not clip at all."""
+    boundary_kl: float | None = None
+    """delta: KL ball in nats, in which the authentic boundary bounds the ratio; None: the one for which the upper bound
+    is 1 + clip_epsilon on average, by the number of action dimensions."""
+    reuse_batches: int = 0
+    """1: PPO-ARC as reconstructed (ppo/reuse.py), an update on the current and the previous batch competes with PPO's,
+    which is not strictly on-policy and the audit reports it; 0: PPO."""
+    contest_kl_weight: float = 1.0
+    """beta: weight of the policy-KL in the score that decides PPO-ARC's contest."""
 
 
 @dataclass(frozen=True)
@@ -234,13 +246,17 @@ _RULES: dict[str, Rule] = {
     ),
     **dict.fromkeys(
         ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every",
-),
+         "contest_kl_weight"),
         AT_LEAST_0,
     ),
     "seed": (lambda v: 0 <= v < 2**32, "a number from 0 to 4294967295"),
     **dict.fromkeys(["proposal_fraction", "beta_anneal"], SHARE),
     **dict.fromkeys(("gamma", "gae_lambda"), (lambda v: 0 <= v <= 1, "a number from 0 to 1")),
-    **dict.fromkeys(("displacement_cap", "top_k"), (lambda v: v is None or v > 0, "a number above 0, or None")),
+    "clip_slope": (lambda v: -1 <= v <= 1, "a number from -1 to 1"),
+    "reuse_batches": (lambda v: 0 <= v <= 1, "a number from 0 to 1"),
+    **dict.fromkeys(
+        ("displacement_cap", "top_k", "boundary_kl"), (lambda v: v is None or v > 0, "a number above 0, or None")
+    ),
     "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),
 }
 # fmt: on

@@ -93,9 +93,11 @@ def leakage(
         jnp.ones_like(probe.actions),
     )
 
+    old_log_std = actor.log_std
+
     def norm(rows: Rows, gated: GatedProposals):
         def loss(actor: Actor):
-            return ppo_loss(actor, rows, ppo.clip_epsilon)[0] + proposal_terms(actor, gated, weights)[0]
+            return ppo_loss(actor, rows, old_log_std, ppo=ppo)[0] + proposal_terms(actor, gated, weights)[0]
 
         return tree_norm(jax.grad(loss)(actor)) / (actor_gradient_norm + DELTA)
 

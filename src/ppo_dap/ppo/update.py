@@ -7,6 +7,7 @@ PPO's gradient: PPO's part of the program is the same whether there is such a te
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,16 @@ from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.gae import gae
 from ppo_dap.ppo.rollout import Rollout
-from ppo_dap.ppo.surrogate import clipped_surrogate, importance_ratio, normalise, weighted_mean
+from ppo_dap.ppo.surrogate import (
+    authentic_boundary_surrogate,
+    authentic_bounds,
+    clipped_surrogate,
+    default_boundary_kl,
+    generalised_clip_surrogate,
+    importance_ratio,
+    normalise,
+    weighted_mean,
+)
 
 ADAM: Any = optax.scale_by_adam(eps=1e-5)
 
@@ -115,14 +125,28 @@ def estimate_advantages(
     )
 
 
-def ppo_loss(actor: Actor, rows: Rows, clip_epsilon: float) -> tuple[Float[Array, ""], tuple]:
-    """Minus Eq. 5 on a minibatch; also the exact KL(pi_theta || pi_old) and the ratio."""
+def ppo_loss(
+    actor: Actor, rows: Rows, old_log_std: Float[Array, " act"], *, ppo: PPOConfig
+) -> tuple[Float[Array, ""], tuple]:
+    """Minus Eq. 5, or minus the configured surrogate in its place, on a minibatch; also the means and the ratio."""
     means = actor(rows.observations)
     log_probs = log_prob(rows.actions, means, actor.log_std)
     # A masked row's ratio is 1: a weight of 0 would not stop an overflow in it.
     ratio = importance_ratio(jnp.where(rows.weights > 0, log_probs, rows.old_log_probs), rows.old_log_probs)
     advantages = normalise(rows.advantages, rows.weights)
-    return -clipped_surrogate(ratio, advantages, rows.weights, clip_epsilon), (means, ratio)
+    return -_surrogate(ratio, advantages, rows, old_log_std, ppo), (means, ratio)
+
+
+def _surrogate(ratio, advantages, rows: Rows, old_log_std, ppo: PPOConfig) -> Float[Array, ""]:
+    if ppo.surrogate == "generalised_clip":
+        return generalised_clip_surrogate(ratio, advantages, rows.weights, ppo.clip_epsilon, ppo.clip_slope)
+    if ppo.surrogate == "authentic_boundary":
+        boundary_kl = ppo.boundary_kl
+        if boundary_kl is None:
+            boundary_kl = default_boundary_kl(rows.actions.shape[-1], ppo.clip_epsilon)
+        z = (rows.actions - rows.old_means) * jnp.exp(-old_log_std)[None]
+        return authentic_boundary_surrogate(ratio, advantages, rows.weights, *authentic_bounds(z, boundary_kl))
+    return clipped_surrogate(ratio, advantages, rows.weights, ppo.clip_epsilon)
 
 
 def value_loss(critic: Critic, rows: Rows) -> Float[Array, ""]:
@@ -206,7 +230,8 @@ def improve_actor(
 def _actor_step(carry, batch, settings: Settings, old_log_std, ppo: PPOConfig, added_gradient):
     (actor, optimizer), (own, extra) = carry, batch
     actor = jax.tree.map(lambda leaf: checkpoint_name(leaf, "theta"), actor)
-    (loss, (means, ratio)), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(actor, own, ppo.clip_epsilon)
+    of_loss = jax.value_and_grad(partial(ppo_loss, ppo=ppo), has_aux=True)
+    (loss, (means, ratio)), gradient = of_loss(actor, own, old_log_std)
     policy_kl = gaussian_kl(means, actor.log_std[None], own.old_means, old_log_std[None])
     metrics = {
         "ppo_loss": loss,
