@@ -78,7 +78,7 @@ def default_boundary_kl(action_size: int, clip_epsilon: float) -> float:
     The average is over |z|, which follows the chi distribution with `action_size` degrees of freedom.
     """
     from scipy.integrate import quad
-    from scipy.optimize import brentq
+    from scipy.optimize import root_scalar
 
     log_norm = (action_size / 2 - 1) * math.log(2) + math.lgamma(action_size / 2)
 
@@ -96,7 +96,7 @@ def default_boundary_kl(action_size: int, clip_epsilon: float) -> float:
     largest = 1.0
     while excess(largest) < 0:
         largest *= 2
-    return 0.5 * brentq(excess, 0.0, largest, xtol=1e-12) ** 2
+    return 0.5 * root_scalar(excess, bracket=(0.0, largest), xtol=1e-12).root ** 2
 
 
 def centred_surrogate(

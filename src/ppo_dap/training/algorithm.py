@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ppo_dap.config import Config
+from ppo_dap.config import Config, PPOConfig
 from ppo_dap.dap import audit
 from ppo_dap.dap.guide import (
     GuideState,
@@ -26,11 +26,21 @@ from ppo_dap.dap.guide import (
     make_proposals,
     on_policy,
 )
-from ppo_dap.dap.objective import Batch, admit, proposal_gradient
+from ppo_dap.dap.objective import Batch, admit, proposal_gradient, provenance
 from ppo_dap.dap.proposals import ProposalDraws
 from ppo_dap.nets.critic import Critic
+from ppo_dap.ppo.reuse import Candidate, contest, no_batch, previous_rows, remember
 from ppo_dap.ppo.rollout import Rollout
-from ppo_dap.ppo.update import Normaliser, PPOState, Rows, Settings, estimate_advantages, improve_actor, improve_critic
+from ppo_dap.ppo.update import (
+    Normaliser,
+    PPOState,
+    PreviousRows,
+    Rows,
+    Settings,
+    estimate_advantages,
+    improve_actor,
+    improve_critic,
+)
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 from ppo_dap.training.draws import Draws
 
@@ -44,6 +54,8 @@ class Learner(eqx.Module):
 
     ppo: PPOState
     guide: GuideState | None
+    previous: Rollout | None = None
+    """The batch before, for PPO-ARC alone."""
 
 
 class Frozen(NamedTuple):
@@ -66,9 +78,10 @@ def create_learner(sizes: tuple[int, int], config: Config, denoiser: Denoiser | 
     """Fresh networks by the config's seed; the guide's come after PPO's, whose start does not depend on them."""
     rng = np.random.default_rng([config.run.seed, NETWORK_STREAM])
     ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size)
+    previous = no_batch(config.ppo, *sizes) if config.ppo.reuse_batches else None
     if denoiser is None:
-        return Learner(ppo, None)
-    return Learner(ppo, create_guide(rng, ppo.critic, sizes, config, denoiser))
+        return Learner(ppo, None, previous)
+    return Learner(ppo, create_guide(rng, ppo.critic, sizes, config, denoiser), previous)
 
 
 class Stages:
@@ -80,6 +93,11 @@ class Stages:
         self.actor = jax.jit(partial(improve_actor, ppo=config.ppo, added_gradient=added_gradient))
         self.critic = jax.jit(partial(improve_critic, ppo=config.ppo))
         self.policy_metrics = jax.jit(audit.policy_metrics)
+        if config.ppo.reuse_batches:
+            self.remember = jax.jit(remember)
+            self.previous_rows = jax.jit(partial(previous_rows, ppo=config.ppo))
+            self.reuse = jax.jit(partial(improve_actor, ppo=config.ppo, added_gradient=added_gradient))
+            self.contest = jax.jit(partial(_contest, ppo=config.ppo))
         if diffusion is not None:
             self.propose = jax.jit(partial(_propose, config=config, diffusion=diffusion))
             self.gate = jax.jit(gate_proposals)
@@ -102,6 +120,19 @@ def _advantages(
     batch = Batch(first_id, rows.raw_observations, rows.weights)
     admitted = admit(rows, batch)
     return admitted, batch, {"batch_fresh": jnp.sum(admitted.weights) / jnp.sum(rows.weights)}
+
+
+def _contest(
+    old_log_std: Float[Array, " act"], own: Candidate, reused: Candidate, rows: Rows, previous: PreviousRows,
+    batch: Batch, *, ppo: PPOConfig,
+) -> Candidate:  # fmt: skip
+    """The winner, and in its metrics the share of the rows it was made of that are of the current batch."""
+    winner, won, metrics = contest(old_log_std, own, reused, rows, previous, ppo=ppo)
+    # The old rows go around the gate, which has no place for them; here it says what it thinks of them.
+    gate = provenance(previous.state_ids, previous.raw_observations, batch)
+    fresh = jnp.sum(rows.weights) + won * jnp.sum(previous.weights * gate)
+    seen = jnp.sum(batch.weights) + won * jnp.sum(previous.weights)
+    return winner._replace(metrics=winner.metrics | metrics | {"batch_fresh": fresh / seen})
 
 
 def _propose(
@@ -150,23 +181,30 @@ def iterate(
     parts, proposed = _collect_and_propose(learner, frozen, rollout, normaliser, schedule, draws, stages, run)
 
     # 2) Advantages with GAE; rows and proposals that are not of the current batch lose their weight.
-    rows, batch, metrics = run("gae", stages.advantages, old.critic, parts, normaliser, reward_std(), schedule.first_id)
+    scale = reward_std()
+    rows, batch, metrics = run("gae", stages.advantages, old.critic, parts, normaliser, scale, schedule.first_id)
     gated: Any = ()
     if guide is not None:
         gated, q_spread, of_proposals = run("proposals", stages.gate, guide, proposed, batch)
         metrics |= of_proposals
 
     # 4) The actor (Eq. 9) and V; Q by one-step TD.
-    actor, actor_optimizer, improved = run(
-        "update", stages.actor, old.actor, old.actor_optimizer, rows, gated, draws.actor, settings
-    )
+    update = (old.actor, old.actor_optimizer, rows, gated)
+    actor, actor_optimizer, improved = run("update", stages.actor, *update, draws.actor, settings)
+    previous = None
+    if learner.previous is not None:
+        ppos = Candidate(actor, actor_optimizer, improved)
+        statistics = (normaliser, scale)
+        (actor, actor_optimizer, improved), previous = _compete(
+            learner, ppos, update, parts, batch, statistics, draws, settings, stages, run
+        )
     metrics |= improved | run("audit", stages.policy_metrics, actor, old.actor.log_std, rows)
     critic, critic_optimizer, valued = run(
         "update", stages.critic, old.critic, old.critic_optimizer, rows, draws.critic, settings.learning_rate
     )
     metrics |= valued
     if guide is None or frozen is None:
-        return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None), metrics
+        return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None, previous), metrics
     visited = on_policy(rows)
     q, critic, q_optimizer, learned = run("update", stages.learn_q, guide, critic, visited, draws.q)
 
@@ -183,7 +221,30 @@ def iterate(
     )
     ppo = PPOState(actor, critic, actor_optimizer, critic_optimizer)
     guide = GuideState(q, q_optimizer, q_spread, adapters, pet_optimizer)
-    return Learner(ppo, guide), metrics | learned | adapted | leaked | moved
+    return Learner(ppo, guide, previous), metrics | learned | adapted | leaked | moved
+
+
+def _compete(
+    learner: Learner,
+    own: Candidate,
+    update: tuple[Any, ...],
+    parts: list[Rollout],
+    batch: Batch,
+    statistics: tuple[Any, ...],
+    draws: Draws,
+    settings: Settings,
+    stages: Stages,
+    run: Callable[..., Any],
+) -> tuple[Candidate, Rollout]:
+    """PPO-ARC: the better of PPO's update and of one on the previous batch as well; and the batch to keep for the next.
+
+    The previous rows do not pass the gate of `admit`: they would not get through, and the audit reports them.
+    """
+    old, rows = learner.ppo, update[2]
+    older = run("gae", stages.previous_rows, old.actor, old.critic, learner.previous, *statistics)
+    reused = Candidate(*run("update", stages.reuse, *update, draws.reuse, settings, older))
+    winner = run("update", stages.contest, old.actor.log_std, own, reused, rows, older, batch)
+    return winner, run("gae", stages.remember, parts)
 
 
 def _collect_and_propose(

@@ -35,6 +35,7 @@ def prove(
         "normaliser": Normaliser(np.zeros(sizes[0], np.float32), np.ones(sizes[0], np.float32)),  # type: ignore[arg-type]
         "schedule": example_schedule(guided=learner.guide is not None),
         "draws": draw(config, 0, sizes[1], learner.guide is not None),
+        "previous": learner.previous,
     }
     if learner.guide is not None and frozen is not None:
         guide = learner.guide
@@ -45,14 +46,14 @@ def prove(
             "offline": frozen.probe,
         }
 
-    def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, draws, **guided):
+    def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, draws, previous, **guided):
         guide = None
         if guided:
             (q, q_optimizer, spread), (adapters, pet_optimizer) = guided["q"], guided["adapters"]
             guide = GuideState(q, q_optimizer, spread, adapters, pet_optimizer)
         rollout, reward_std = on_policy
         new, _ = iterate(
-            Learner(PPOState(actor, critic, *ppo_optimizers), guide),
+            Learner(PPOState(actor, critic, *ppo_optimizers), guide, previous),
             Frozen(guided["backbone"], guided["offline"]) if guided else None,
             rollout,
             normaliser,
@@ -63,7 +64,8 @@ def prove(
             run,
         )
         ppo, g = new.ppo, new.guide
-        results = {"actor": ppo.actor, "critic": ppo.critic, "rest": (ppo.actor_optimizer, ppo.critic_optimizer, g)}
+        rest = (ppo.actor_optimizer, ppo.critic_optimizer, g, new.previous)
+        results = {"actor": ppo.actor, "critic": ppo.critic, "rest": rest}
         return results if g is None else results | {"adapters": g.adapters}
 
     traced = trace(whole_update, arguments)
