@@ -237,9 +237,14 @@ def test_a_boundless_trust_region_is_ppo_without_a_clip_bit_for_bit():
 
 
 def test_the_default_trust_region_is_the_one_of_the_actions_dimension():
-    named = improved(surrogate="authentic_boundary", boundary_kl=default_boundary_kl(2, EPSILON))
-    assert_same_bits(improved(surrogate="authentic_boundary"), named)
-    assert differ(improved(surrogate="authentic_boundary", boundary_kl=default_boundary_kl(3, EPSILON))[0], named[0])
+    moved = changed(STATE.actor, log_std=STATE.actor.log_std - 0.2)
+
+    def loss(**options):
+        ppo = small_config(surrogate="authentic_boundary", **options)
+        return float(ppo_loss(moved, ROWS, STATE.actor.log_std, ppo=ppo)[0])
+
+    assert loss() == loss(boundary_kl=default_boundary_kl(2, EPSILON)) != loss(boundary_kl=default_boundary_kl(3, 0.2))
+    assert loss(clip_epsilon=0.5) == loss(boundary_kl=default_boundary_kl(2, 0.5)) != loss()
 
 
 def test_bounds_are_those_of_the_old_policys_spread():

@@ -189,15 +189,9 @@ def iterate(
         metrics |= of_proposals
 
     # 4) The actor (Eq. 9) and V; Q by one-step TD.
-    update = (old.actor, old.actor_optimizer, rows, gated)
-    actor, actor_optimizer, improved = run("update", stages.actor, *update, draws.actor, settings)
-    previous = None
-    if learner.previous is not None:
-        ppos = Candidate(actor, actor_optimizer, improved)
-        statistics = (normaliser, scale)
-        (actor, actor_optimizer, improved), previous = _compete(
-            learner, ppos, update, parts, batch, statistics, draws, settings, stages, run
-        )
+    (actor, actor_optimizer, improved), previous = _improve_policy(
+        learner, rows, gated, parts, batch, (normaliser, scale), draws, settings, stages, run
+    )
     metrics |= improved | run("audit", stages.policy_metrics, actor, old.actor.log_std, rows)
     critic, critic_optimizer, valued = run(
         "update", stages.critic, old.critic, old.critic_optimizer, rows, draws.critic, settings.learning_rate
@@ -224,10 +218,10 @@ def iterate(
     return Learner(ppo, guide, previous), metrics | learned | adapted | leaked | moved
 
 
-def _compete(
+def _improve_policy(
     learner: Learner,
-    own: Candidate,
-    update: tuple[Any, ...],
+    rows: Rows,
+    gated: Any,
     parts: list[Rollout],
     batch: Batch,
     statistics: tuple[Any, ...],
@@ -235,12 +229,16 @@ def _compete(
     settings: Settings,
     stages: Stages,
     run: Callable[..., Any],
-) -> tuple[Candidate, Rollout]:
-    """PPO-ARC: the better of PPO's update and of one on the previous batch as well; and the batch to keep for the next.
+) -> tuple[Candidate, Rollout | None]:
+    """PPO's update; with a previous batch, the better of that and of one on both batches. And the batch to keep.
 
     The previous rows do not pass the gate of `admit`: they would not get through, and the audit reports them.
     """
-    old, rows = learner.ppo, update[2]
+    old = learner.ppo
+    update = (old.actor, old.actor_optimizer, rows, gated)
+    own = Candidate(*run("update", stages.actor, *update, draws.actor, settings))
+    if learner.previous is None:
+        return own, None
     older = run("gae", stages.previous_rows, old.actor, old.critic, learner.previous, *statistics)
     reused = Candidate(*run("update", stages.reuse, *update, draws.reuse, settings, older))
     winner = run("update", stages.contest, old.actor.log_std, own, reused, rows, older, batch)
