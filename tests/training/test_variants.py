@@ -3,6 +3,7 @@
 import errno
 import os
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -79,3 +80,13 @@ def test_a_run_that_reuses_a_batch_says_so_and_resumes_with_the_same_bits(tmp_pa
     assert kept["learner.previous.state_ids"].max() == 2 * 256 - 1  # of the second iteration
     trained(tmp_path / "run", 1000, reuse_batches=1, resume=True)
     assert_same(tmp_path / "run", tmp_path / "whole")
+
+
+def test_a_run_whose_old_batches_never_win_is_ppo_bit_for_bit(tmp_path, monkeypatch):
+    """Every contest is a draw, and a draw is PPO's: the second candidate, its orders and its batch leave no trace."""
+    monkeypatch.setattr(reuse, "score", lambda *arguments: (jnp.float32(0), jnp.float32(0)))
+    arc, ppo = trained(tmp_path / "arc", reuse_batches=1), trained(tmp_path / "ppo")
+    theirs, ours = (load_file(run.folder / "checkpoints" / "last.safetensors") for run in (ppo, arc))
+    assert {name for name in ours if "previous" not in name} == theirs.keys() != ours.keys()
+    assert all(ours[name].tobytes() == theirs[name].tobytes() for name in theirs)
+    assert [row["policy_kl"] for row in arc.metrics] == [row["policy_kl"] for row in ppo.metrics]
