@@ -1,5 +1,6 @@
 """A scripted task, a small numpy policy and random rows for the tests of PPO."""
 
+import equinox as eqx
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -55,6 +56,11 @@ def make_policy(seed=0, observation_size=2, action_size=2, task=None):
         np.resize(HIGH, action_size),
         task,
     )
+
+
+def changed(node, **values):
+    """A copy of a module with some fields replaced."""
+    return eqx.tree_at(lambda n: [getattr(n, name) for name in values], node, list(values.values()))
 
 
 def small_config(**changes):

@@ -139,7 +139,7 @@ def test_where_every_row_is_clipped_nothing_moves():
 
 def test_gradient_of_the_spread_is_the_score_times_the_normalised_advantage():
     """At ratio 1, d(surrogate)/d(log_std) = mean(A (z^2 - 1))."""
-    gradient = jax.jit(jax.grad(lambda actor: ppo_loss(actor, ROWS, 0.2)[0]))(STATE.actor)
+    gradient = jax.jit(jax.grad(lambda actor: ppo_loss(actor, ROWS, STATE.actor.log_std, ppo=PPO)[0]))(STATE.actor)
     advantages = np.asarray(ROWS.advantages)
     advantages = (advantages - advantages.mean()) / advantages.std()
     z = np.asarray(ROWS.actions - ROWS.old_means)

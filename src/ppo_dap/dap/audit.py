@@ -93,10 +93,12 @@ def leakage(
         jnp.ones_like(probe.actions),
     )
 
+    old_log_std = actor.log_std
+
     def norm(rows: Rows, gated: GatedProposals):
         def loss(actor: Actor):
             added, _ = added_terms(actor, rows, gated, weights, config=config.objective)
-            return ppo_loss(actor, rows, config.ppo.clip_epsilon)[0] + added
+            return ppo_loss(actor, rows, old_log_std, ppo=config.ppo)[0] + added
 
         return tree_norm(jax.grad(loss)(actor)) / (actor_gradient_norm + DELTA)
 
@@ -168,28 +170,28 @@ FORBIDDEN: tuple[tuple[str, str, str, str, frozenset[str]], ...] = (
         "the importance ratio is made of theta and D_on",
         "cut",
         "tag:ratio",
-        frozenset({"proposals", "offline", "backbone", "adapters", "q"}),
+        frozenset({"proposals", "offline", "backbone", "adapters", "q", "previous"}),
     ),
     (
         "(i)",
         "the advantages are made of V and D_on",
         "full",
         "tag:advantages",
-        frozenset({"proposals", "offline", "backbone", "adapters", "q"}),
+        frozenset({"proposals", "offline", "backbone", "adapters", "q", "previous"}),
     ),
     (
         "(i)",
         "V and its trunk learn from D_on alone, not from Q or proposals",
         "full",
         "out:critic",
-        frozenset({"proposals", "offline", "backbone", "adapters", "q"}),
+        frozenset({"proposals", "offline", "backbone", "adapters", "q", "previous"}),
     ),
     (
         "(iii)",
         "PET's gradient is made of D_on and the prior, not of actor, critic, Q, proposals or logs",
         "full",
         "out:adapters",
-        frozenset({"proposals", "offline", "actor", "critic", "q", "ppo_optimizers"}),
+        frozenset({"proposals", "offline", "actor", "critic", "q", "ppo_optimizers", "previous"}),
     ),
     ("(iv)", "no array of D_off reaches the new policy", "full", "out:actor", frozenset({"offline"})),
     ("(iv)", "no array of D_off reaches the optimizers, Q or the prior", "full", "out:rest", frozenset({"offline"})),

@@ -7,6 +7,7 @@ PPO's gradient: PPO's part of the program is the same whether there is such a te
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,17 @@ from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.gae import gae
 from ppo_dap.ppo.rollout import Rollout
-from ppo_dap.ppo.surrogate import clipped_surrogate, importance_ratio, normalise, weighted_mean
+from ppo_dap.ppo.surrogate import (
+    authentic_boundary_surrogate,
+    authentic_bounds,
+    centred_surrogate,
+    clipped_surrogate,
+    default_boundary_kl,
+    generalised_clip_surrogate,
+    importance_ratio,
+    normalise,
+    weighted_mean,
+)
 
 ADAM: Any = optax.scale_by_adam(eps=1e-5)
 
@@ -55,6 +66,22 @@ class Rows(eqx.Module):
     advantages: Float[Array, " rows"]
     returns: Float[Array, " rows"]
     q_targets: Float[Array, " rows"]
+    weights: Float[Array, " rows"]
+    """1, or 0 for a row in which no transition happened."""
+
+
+class PreviousRows(eqx.Module):
+    """D_{k-1} flattened to rows, as the iteration after it sees them (ppo/reuse.py)."""
+
+    state_ids: Int[Array, " rows"]
+    raw_observations: Float[Array, "rows obs"]
+    observations: Float[Array, "rows obs"]
+    actions: Float[Array, "rows act"]
+    old_log_probs: Float[Array, " rows"]
+    """Of the policy that acted, pi_{k-1}."""
+    centre: Float[Array, " rows"]
+    """pi_k(a | s) / pi_{k-1}(a | s)."""
+    advantages: Float[Array, " rows"]
     weights: Float[Array, " rows"]
     """1, or 0 for a row in which no transition happened."""
 
@@ -115,14 +142,46 @@ def estimate_advantages(
     )
 
 
-def ppo_loss(actor: Actor, rows: Rows, clip_epsilon: float) -> tuple[Float[Array, ""], tuple]:
-    """Minus Eq. 5 on a minibatch; also the exact KL(pi_theta || pi_old) and the ratio."""
+def ppo_loss(
+    actor: Actor,
+    rows: Rows,
+    old_log_std: Float[Array, " act"],
+    previous: PreviousRows | None = None,
+    *,
+    ppo: PPOConfig,
+) -> tuple[Float[Array, ""], tuple]:
+    """Minus Eq. 5, or minus the configured surrogate in its place, on a minibatch; also the means and the ratio.
+
+    With `previous` rows, minus the mean of that and of their own surrogate, each normalised on its own.
+    """
     means = actor(rows.observations)
     log_probs = log_prob(rows.actions, means, actor.log_std)
     # A masked row's ratio is 1: a weight of 0 would not stop an overflow in it.
     ratio = importance_ratio(jnp.where(rows.weights > 0, log_probs, rows.old_log_probs), rows.old_log_probs)
     advantages = normalise(rows.advantages, rows.weights)
-    return -clipped_surrogate(ratio, advantages, rows.weights, clip_epsilon), (means, ratio)
+    surrogate = _surrogate(ratio, advantages, rows, old_log_std, ppo)
+    if previous is not None:
+        surrogate = 0.5 * (surrogate + _previous_surrogate(actor, previous, ppo))
+    return -surrogate, (means, ratio)
+
+
+def _previous_surrogate(actor: Actor, rows: PreviousRows, ppo: PPOConfig) -> Float[Array, ""]:
+    log_probs = log_prob(rows.actions, actor(rows.observations), actor.log_std)
+    ratio = importance_ratio(jnp.where(rows.weights > 0, log_probs, rows.old_log_probs), rows.old_log_probs)
+    advantages = normalise(rows.advantages, rows.weights)
+    return centred_surrogate(ratio, rows.centre, advantages, rows.weights, ppo.clip_epsilon)
+
+
+def _surrogate(ratio, advantages, rows: Rows, old_log_std, ppo: PPOConfig) -> Float[Array, ""]:
+    if ppo.surrogate == "generalised_clip":
+        return generalised_clip_surrogate(ratio, advantages, rows.weights, ppo.clip_epsilon, ppo.clip_slope)
+    if ppo.surrogate == "authentic_boundary":
+        boundary_kl = ppo.boundary_kl
+        if boundary_kl is None:
+            boundary_kl = default_boundary_kl(rows.actions.shape[-1], ppo.clip_epsilon)
+        z = (rows.actions - rows.old_means) * jnp.exp(-old_log_std)[None]
+        return authentic_boundary_surrogate(ratio, advantages, rows.weights, *authentic_bounds(z, boundary_kl))
+    return clipped_surrogate(ratio, advantages, rows.weights, ppo.clip_epsilon)
 
 
 def value_loss(critic: Critic, rows: Rows) -> Float[Array, ""]:
@@ -165,6 +224,7 @@ def improve_actor(
     added: Any,
     orders: Orders,
     settings: Settings,
+    previous: PreviousRows | None = None,
     *,
     ppo: PPOConfig,
     added_gradient: AddedGradient | None = None,
@@ -172,8 +232,8 @@ def improve_actor(
     """Step 4, the actor: `num_epochs` passes over D_on in shuffled minibatches, fewer when the KL rule stops them.
 
     `added` holds what `added_gradient` sees, with a multiple of the number of minibatches as leading axis; it is
-    shuffled and dealt out like D_on's rows, by orders of its own. The metric `pgshare` is Eq. 13: the norm of
-    PPO's gradient over that of the whole.
+    shuffled and dealt out like D_on's rows, by orders of its own. Rows of a `previous` batch, as many as D_on's, are
+    dealt out beside them. The metric `pgshare` is Eq. 13: the norm of PPO's gradient over that of the whole.
     """
     num_minibatches = ppo.rollout_steps // ppo.minibatch_size
     old_log_std = actor.log_std
@@ -182,7 +242,7 @@ def improve_actor(
         return _actor_step(carry, batch, settings, old_log_std, ppo, added_gradient)
 
     def run(carry, order):
-        batches = deal(rows, order.rows, num_minibatches), deal(added, order.added, num_minibatches)
+        batches = deal((rows, previous), order.rows, num_minibatches), deal(added, order.added, num_minibatches)
         carry, metrics = jax.lax.scan(minibatch_step, carry, batches)
         return carry, jnp.mean(metrics["policy_kl_minibatch"]) > settings.kl_limit, metrics
 
@@ -204,9 +264,10 @@ def improve_actor(
 
 
 def _actor_step(carry, batch, settings: Settings, old_log_std, ppo: PPOConfig, added_gradient):
-    (actor, optimizer), (own, extra) = carry, batch
+    (actor, optimizer), ((own, previous), extra) = carry, batch
     actor = jax.tree.map(lambda leaf: checkpoint_name(leaf, "theta"), actor)
-    (loss, (means, ratio)), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(actor, own, ppo.clip_epsilon)
+    of_loss = jax.value_and_grad(partial(ppo_loss, ppo=ppo), has_aux=True)
+    (loss, (means, ratio)), gradient = of_loss(actor, own, old_log_std, previous)
     policy_kl = gaussian_kl(means, actor.log_std[None], own.old_means, old_log_std[None])
     metrics = {
         "ppo_loss": loss,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ppo_dap.config import Config
+from ppo_dap.config import Config, PPOConfig
 from ppo_dap.dap import audit
 from ppo_dap.dap.guide import (
     GuideState,
@@ -25,11 +25,21 @@ from ppo_dap.dap.guide import (
     make_proposals,
     on_policy,
 )
-from ppo_dap.dap.objective import Batch, added_gradient, admit
+from ppo_dap.dap.objective import Batch, added_gradient, admit, provenance
 from ppo_dap.dap.proposals import ProposalDraws, Proposer
 from ppo_dap.nets.critic import Critic
+from ppo_dap.ppo.reuse import Candidate, contest, no_batch, previous_rows, remember
 from ppo_dap.ppo.rollout import Rollout
-from ppo_dap.ppo.update import Normaliser, PPOState, Rows, Settings, estimate_advantages, improve_actor, improve_critic
+from ppo_dap.ppo.update import (
+    Normaliser,
+    PPOState,
+    PreviousRows,
+    Rows,
+    Settings,
+    estimate_advantages,
+    improve_actor,
+    improve_critic,
+)
 from ppo_dap.priors.network import Network
 from ppo_dap.training.draws import Draws
 
@@ -43,6 +53,8 @@ class Learner(eqx.Module):
 
     ppo: PPOState
     guide: GuideState | None
+    previous: Rollout | None = None
+    """The batch before, for PPO-ARC alone."""
 
 
 class Frozen(NamedTuple):
@@ -66,9 +78,10 @@ def create_learner(sizes: tuple[int, int], config: Config, prior: Network | None
     """Fresh networks by the config's seed; the guide's come after PPO's, whose start does not depend on them."""
     rng = np.random.default_rng([config.run.seed, NETWORK_STREAM])
     ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size)
+    previous = no_batch(config.ppo, *sizes) if config.ppo.reuse_batches else None
     if prior is None:
-        return Learner(ppo, None)
-    return Learner(ppo, create_guide(rng, ppo.critic, sizes, config, prior))
+        return Learner(ppo, None, previous)
+    return Learner(ppo, create_guide(rng, ppo.critic, sizes, config, prior), previous)
 
 
 class Stages:
@@ -81,6 +94,11 @@ class Stages:
         self.critic = jax.jit(partial(improve_critic, ppo=config.ppo))
         self.policy_metrics = jax.jit(audit.policy_metrics)
         self.seeks_mode = config.proposals.mode_seeking > 0
+        if config.ppo.reuse_batches:
+            self.remember = jax.jit(remember)
+            self.previous_rows = jax.jit(partial(previous_rows, ppo=config.ppo))
+            self.reuse = jax.jit(partial(improve_actor, ppo=config.ppo, added_gradient=added))
+            self.contest = jax.jit(partial(_contest, ppo=config.ppo))
         if guided:
             self.propose = jax.jit(partial(_propose, config=config))
             self.gate = jax.jit(gate_proposals)
@@ -108,6 +126,19 @@ def _advantages(
     batch = Batch(first_id, rows.raw_observations, rows.weights)
     admitted = admit(rows, batch)
     return admitted, batch, {"batch_fresh": jnp.sum(admitted.weights) / jnp.sum(rows.weights)}
+
+
+def _contest(
+    old_log_std: Float[Array, " act"], own: Candidate, reused: Candidate, rows: Rows, previous: PreviousRows,
+    batch: Batch, *, ppo: PPOConfig,
+) -> Candidate:  # fmt: skip
+    """The winner, and in its metrics the share of the rows it was made of that are of the current batch."""
+    winner, won, metrics = contest(old_log_std, own, reused, rows, previous, ppo=ppo)
+    # The old rows go around the gate, which has no place for them; here it says what it thinks of them.
+    gate = provenance(previous.state_ids, previous.raw_observations, batch)
+    fresh = jnp.sum(rows.weights) + won * jnp.sum(previous.weights * gate)
+    seen = jnp.sum(batch.weights) + won * jnp.sum(previous.weights)
+    return winner._replace(metrics=winner.metrics | metrics | {"batch_fresh": fresh / seen})
 
 
 def _propose(
@@ -155,15 +186,16 @@ def iterate(
     parts, proposed = _collect_and_propose(learner, frozen, rollout, normaliser, schedule, draws, stages, run)
 
     # 2) Advantages with GAE; rows and proposals that are not of the current batch lose their weight.
-    rows, batch, metrics = run("gae", stages.advantages, old.critic, parts, normaliser, reward_std(), schedule.first_id)
+    scale = reward_std()
+    rows, batch, metrics = run("gae", stages.advantages, old.critic, parts, normaliser, scale, schedule.first_id)
     gated: Any = ()
     if guide is not None:
         gated, q_spread, of_proposals = run("proposals", stages.gate, guide, proposed, batch)
         metrics |= of_proposals
 
     # 4) The actor (Eq. 9) and V; Q by one-step TD.
-    actor, actor_optimizer, improved = run(
-        "update", stages.actor, old.actor, old.actor_optimizer, rows, gated, draws.actor, settings
+    (actor, actor_optimizer, improved), previous = _improve_policy(
+        learner, rows, gated, parts, batch, (normaliser, scale), draws, settings, stages, run
     )
     metrics |= improved | run("audit", stages.policy_metrics, actor, old.actor.log_std, rows)
     critic, critic_optimizer, valued = run(
@@ -171,17 +203,16 @@ def iterate(
     )
     metrics |= valued
     if guide is None or frozen is None:
-        return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None), metrics
+        return Learner(PPOState(actor, critic, actor_optimizer, critic_optimizer), None, previous), metrics
     visited = on_policy(rows)
     learned = run("update", stages.learn_q, guide, critic, old.critic, visited, draws.q)
     critic = learned.critic
 
     # 5) PET: the adapters alone, on D_on.
-    adapters, pet_optimizer, adapted = guide.adapters, guide.pet_optimizer, {}
-    if adapters is not None:
-        adapters, pet_optimizer, adapted = run(
-            "pet", stages.adapt, guide, frozen.prior, visited, batch, schedule.pet_steps, draws.pet
-        )
+    tuned = guide.adapters, guide.pet_optimizer, {}
+    if guide.adapters is not None:
+        tuned = run("pet", stages.adapt, guide, frozen.prior, visited, batch, schedule.pet_steps, draws.pet)
+    adapters, pet_optimizer, adapted = tuned
 
     # 6) Monitoring.
     norm = improved["actor_gradient_norm"]
@@ -191,7 +222,34 @@ def iterate(
     ppo = PPOState(actor, critic, actor_optimizer, critic_optimizer)
     own = learned.q, learned.optimizer, q_spread, learned.q_rank, guide.calibration, learned.judged
     guide = GuideState(*own, adapters, pet_optimizer)
-    return Learner(ppo, guide), metrics | learned.metrics | adapted | leaked | moved
+    return Learner(ppo, guide, previous), metrics | learned.metrics | adapted | leaked | moved
+
+
+def _improve_policy(
+    learner: Learner,
+    rows: Rows,
+    gated: Any,
+    parts: list[Rollout],
+    batch: Batch,
+    statistics: tuple[Any, ...],
+    draws: Draws,
+    settings: Settings,
+    stages: Stages,
+    run: Callable[..., Any],
+) -> tuple[Candidate, Rollout | None]:
+    """PPO's update; with a previous batch, the better of that and of one on both batches. And the batch to keep.
+
+    The previous rows do not pass the gate of `admit`: they would not get through, and the audit reports them.
+    """
+    old = learner.ppo
+    update = (old.actor, old.actor_optimizer, rows, gated)
+    own = Candidate(*run("update", stages.actor, *update, draws.actor, settings))
+    if learner.previous is None:
+        return own, None
+    older = run("gae", stages.previous_rows, old.actor, old.critic, learner.previous, *statistics)
+    reused = Candidate(*run("update", stages.reuse, *update, draws.reuse, settings, older))
+    winner = run("update", stages.contest, old.actor.log_std, own, reused, rows, older, batch)
+    return winner, run("gae", stages.remember, parts)
 
 
 def _collect_and_propose(

@@ -22,7 +22,7 @@ from ppo_dap.priors.network import Network
 
 PARTS = 8
 """Most parts of a rollout: proposals on each are computed while the next is collected."""
-PPO_STREAM, GUIDE_STREAM = 3, 4
+PPO_STREAM, GUIDE_STREAM, REUSE_STREAM = 3, 4, 7
 
 
 class Draws(NamedTuple):
@@ -34,6 +34,8 @@ class Draws(NamedTuple):
     q: Any = ()
     pet: Any = ()
     audit: Any = ()
+    reuse: Any = ()
+    """Orders of the candidate that uses the previous batch again."""
 
 
 def num_parts(config: Config) -> int:
@@ -47,7 +49,8 @@ def draw(config: Config, iteration: int, prior: Network | None) -> Draws:
     rng = np.random.default_rng([config.run.seed, PPO_STREAM, iteration])
     actor, critic = (draw_orders(rng, ppo.num_epochs, rows) for _ in range(2))
     if prior is None:
-        return Draws(Orders(actor, np.zeros((ppo.num_epochs, 0), np.int32)), critic)  # type: ignore[arg-type]
+        nothing = np.zeros((ppo.num_epochs, 0), np.int32)
+        return Draws(Orders(actor, nothing), critic, reuse=_reuse(config, iteration, 0))  # type: ignore[arg-type]
     rng = np.random.default_rng([config.run.seed, GUIDE_STREAM, iteration])
     parts = num_parts(config)
     states = num_proposal_states(rows, parts, config)
@@ -60,4 +63,12 @@ def draw(config: Config, iteration: int, prior: Network | None) -> Draws:
         draw_orders(rng, config.q.q_epochs, rows),
         PETDraws.make(rng, prior, updates, config.adaptation) if is_tuned(prior, config.adaptation) else (),
         rng.standard_normal(prior.noise_shape(PROXY_SOLVER, few, k), dtype=np.float32),
+        _reuse(config, iteration, states),
     )
+
+
+def _reuse(config: Config, iteration: int, added: int) -> Any:
+    if not config.ppo.reuse_batches:
+        return ()
+    rng = np.random.default_rng([config.run.seed, REUSE_STREAM, iteration])
+    return Orders(*(draw_orders(rng, config.ppo.num_epochs, n) for n in (config.ppo.rollout_steps, added)))  # type: ignore[arg-type]

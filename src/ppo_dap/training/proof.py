@@ -35,6 +35,7 @@ def prove(
         "normaliser": Normaliser(np.zeros(sizes[0], np.float32), np.ones(sizes[0], np.float32)),  # type: ignore[arg-type]
         "schedule": example_schedule(config, guided=learner.guide is not None),
         "draws": draw(config, 0, None if frozen is None else frozen.prior),
+        "previous": learner.previous,
     }
     if learner.guide is not None and frozen is not None:
         guide = learner.guide
@@ -45,13 +46,13 @@ def prove(
             "offline": frozen.probe,
         }
 
-    def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, draws, **guided):
+    def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, draws, previous, **guided):
         guide = None
         if guided:
             guide = GuideState(*guided["q"], *guided["adapters"])
         rollout, reward_std = on_policy
         new, _ = iterate(
-            Learner(PPOState(actor, critic, *ppo_optimizers), guide),
+            Learner(PPOState(actor, critic, *ppo_optimizers), guide, previous),
             Frozen(*guided["backbone"], probe=guided["offline"]) if guided else None,
             rollout,
             normaliser,
@@ -62,7 +63,8 @@ def prove(
             run,
         )
         ppo, g = new.ppo, new.guide
-        results = {"actor": ppo.actor, "critic": ppo.critic, "rest": (ppo.actor_optimizer, ppo.critic_optimizer, g)}
+        rest = (ppo.actor_optimizer, ppo.critic_optimizer, g, new.previous)
+        results = {"actor": ppo.actor, "critic": ppo.critic, "rest": rest}
         return results if g is None or g.adapters is None else results | {"adapters": g.adapters}
 
     traced = trace(whole_update, arguments)
