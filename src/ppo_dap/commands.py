@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -210,6 +211,34 @@ def audit(options: argparse.Namespace) -> int:
         print("\n".join(map(str, claims)))
         print(f"verdict: {'NOT strictly on-policy' if violated else 'strictly on-policy (Definition 1)'}")
     return 1 if violated else 0
+
+
+def reliability(options: argparse.Namespace) -> int:
+    """How far a run's Q can be trusted (5.7)."""
+    prepare_jax()
+    from ppo_dap.study import reliability_report as study
+    from ppo_dap.study.diagnostic_figures import require_png
+
+    png = None if options.png is None else require_png(options.png)
+    names = ("states", "rollouts", "horizon", "checkpoint", "seed")
+    given = {name: getattr(options, name) for name in names}
+    found = study.reliability(options.folder, options.prior, **given, progress=study.show_progress(options.states))
+    if options.json:
+        print(json.dumps(without_nan(found.report)))
+    else:
+        study.print_reliability(found.report)
+    if png is not None:
+        study.reliability_figure(found, png)
+    return 0
+
+
+def without_nan(value: Any) -> Any:
+    """`value` with None for every number that is none: JSON has no NaN."""
+    if isinstance(value, Mapping):
+        return {name: without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [without_nan(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def summary(options: argparse.Namespace) -> int:
