@@ -117,13 +117,22 @@ class GuidedRun:
 
     def gae(self, trajectory: Walk) -> Float[np.ndarray, " steps"]:
         """GAE advantages of a walk, as PPO would take them."""
-        rewards = self.scoring(trajectory.rewards)
-        columns = (rewards, self.values(trajectory.observations), self.values(trajectory.next_observations))
-        ends, valid = (trajectory.terminated, trajectory.truncated), np.ones(len(rewards), bool)
-        numbers = (jnp.asarray(c[:, None], jnp.float32) for c in columns)
-        flags = (jnp.asarray(f[:, None]) for f in (*ends, valid))
+
+        def column(values):
+            return jnp.asarray(values)[:, None]
+
         ppo = self.config.ppo
-        return np.asarray(gae(*numbers, *flags, ppo.gamma, ppo.gae_lambda), np.float64)[:, 0]
+        advantages = gae(
+            column(np.float32(self.scoring(trajectory.rewards))),
+            column(np.float32(self.values(trajectory.observations))),
+            column(np.float32(self.values(trajectory.next_observations))),
+            column(trajectory.terminated),
+            column(trajectory.truncated),
+            column(np.ones(len(trajectory.rewards), bool)),
+            ppo.gamma,
+            ppo.gae_lambda,
+        )
+        return np.asarray(advantages, np.float64)[:, 0]
 
 
 def _propose(guided: GuidedRun, visited: Visited, draws: ProposalDraws, config: Config):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -109,7 +110,7 @@ def _actions(guided: GuidedRun, trajectory: Walk, seed: int) -> tuple[Float[np.n
         "policy": trajectory.actions[trajectory.kept][:, None],
     }
     edges = np.cumsum([0, *(part.shape[1] for part in found.values())])
-    groups = {name: slice(*edge) for name, edge in zip(found, zip(edges[:-1], edges[1:], strict=True), strict=True)}
+    groups = {name: slice(*edge) for name, edge in zip(found, itertools.pairwise(edges), strict=True)}
     return np.concatenate(list(found.values()), axis=1), groups
 
 
@@ -182,9 +183,8 @@ def print_reliability(report: Mapping[str, Any]) -> None:
     """The report in words."""
     r = report
     what = f"{r['rollouts']} rollouts of {r['horizon']} steps an action" if r["monte_carlo"] else r["note"]
-    print(
-        f"{r['task']} at {r['env_steps']:,} steps, {r['states']} states; {what}; in Q's units (reward / {r['reward_std']:.3g})"
-    )
+    print(f"{r['task']} at {r['env_steps']:,} steps, {r['states']} states; {what}")
+    print(f"in Q's units, reward / {r['reward_std']:.3g}:")
     for name, m in r["q"].items():
         interval = f"[{m['rho_low']:.2f}, {m['rho_high']:.2f}] over {m['rho_states']} states"
         print(
@@ -236,7 +236,7 @@ def reliability_figure(found: Reliability, path: Path) -> None:
         axes.set(
             xlabel="Q(s, a)",
             ylabel="G(s, a), mean of the rollouts" if found.report["monte_carlo"] else "discounted return to go",
-            title=f"{found.report['task']}, {found.report['env_steps']:,} steps: rho {rho:.2f}, ECE {proposals['ece']:.2g}",
+            title=f"{found.report['task']}: rho {rho:.2f}, ECE {proposals['ece']:.2g}",
         )
         axes.legend(frameon=False, fontsize=8)
 

@@ -81,7 +81,7 @@ def make_restorable(task: str, copies: int, seed: int = 0) -> list[MujocoSimulat
     simulators = [MujocoSimulator(env) for env in envs]
     space = envs[0].action_space
     actions = np.random.default_rng(seed).uniform(space.low, space.high, (2 * PROBE_STEPS, len(space.low)))
-    return simulators[:copies] if repeats(*simulators[:2], actions.astype(space.dtype)) else None
+    return simulators[:copies] if repeats(simulators[0], simulators[1], actions.astype(space.dtype)) else None
 
 
 def repeats(one: Restorable, other: Restorable, actions: Float[np.ndarray, "steps act"]) -> bool:
@@ -90,8 +90,8 @@ def repeats(one: Restorable, other: Restorable, actions: Float[np.ndarray, "step
     for action in actions[:half]:
         one.step(action)
     saved = one.save()
-    for action in actions[half:]:
-        other.step(action)  # another past, which must leave no trace
+    for action in actions[half : half + half // 3]:
+        other.step(action)  # another past, of another length, which must leave no trace
     seen = [one.step(action) for action in actions[half:]]
     other.restore(saved)
     again = [other.step(action) for action in actions[half:]]
