@@ -179,6 +179,11 @@ def _diagnostics(command: Command) -> None:
     sub.add_argument("--json", action="store_true", help="print JSON")
     sub.add_argument("--png", metavar="FILE", help="draw Q against the returns to this .png as well")
 
+    sub = command("bound", commands.bound, "the terms of the performance bound (Eq. 14) over a run's iterations")
+    sub.add_argument("folder", metavar="RUN", help="run folder")
+    sub.add_argument("--json", action="store_true", help="print JSON")
+    sub.add_argument("--png", metavar="FILE", help="draw the terms by iteration to this .png as well")
+
 
 def _collect_options(command: Command) -> None:
     sub = command("collect", commands.collect, "log episodes of a run's policy, or make tiers of logs for a task")

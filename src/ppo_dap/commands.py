@@ -232,6 +232,23 @@ def reliability(options: argparse.Namespace) -> int:
     return 0
 
 
+def bound(options: argparse.Namespace) -> int:
+    """The terms of Eq. 14 by iteration."""
+    prepare_jax()
+    from ppo_dap.study import bound as study
+    from ppo_dap.study.diagnostic_figures import require_png
+
+    png = None if options.png is None else require_png(options.png)
+    found = study.bound(options.folder)
+    if options.json:
+        print(json.dumps(without_nan(found.report)))
+    else:
+        study.print_bound(found.report)
+    if png is not None:
+        study.bound_figure(found, png)
+    return 0
+
+
 def without_nan(value: Any) -> Any:
     """`value` with None for every number that is none: JSON has no NaN."""
     if isinstance(value, Mapping):

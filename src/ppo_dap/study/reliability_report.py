@@ -186,10 +186,15 @@ def print_reliability(report: Mapping[str, Any]) -> None:
     print(f"{r['task']} at {r['env_steps']:,} steps, {r['states']} states; {what}")
     print(f"in Q's units, reward / {r['reward_std']:.3g}:")
     for name, m in r["q"].items():
-        interval = f"[{m['rho_low']:.2f}, {m['rho_high']:.2f}] over {m['rho_states']} states"
+        within = "one action a state"
+        if m["rho_states"]:
+            within = (
+                f"rho {m['rho']:.2f} [{m['rho_low']:.2f}, {m['rho_high']:.2f}] in {m['rho_states']} states (a true Q: "
+                f"{r['rank_ceiling'][name]:.2f})"
+            )
         print(
-            f"{name:>9}: rho {m['rho']:.2f} {interval} (a true Q: {r['rank_ceiling'][name]:.2f}), pooled "
-            f"{m['rho_pooled']:.2f}, MAE {m['mae']:.3g}, bias {m['bias']:+.3g}, ECE {m['ece']:.3g}"
+            f"{name:>9}: {within}, pooled {m['rho_pooled']:.2f}, MAE {m['mae']:.3g}, bias {m['bias']:+.3g}, ECE "
+            f"{m['ece']:.3g}"
         )
     for name, m in r["calibration"].items():
         print(f"calibration {name}: MAE {m['mae']:.3g}, ECE {m['ece']:.3g} on held-out states")

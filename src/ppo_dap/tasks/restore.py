@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from ppo_dap.errors import InputError
 from ppo_dap.tasks.catalogue import make_gymnasium
 
 MEMORY = ("_rewards",)
@@ -69,10 +70,13 @@ def make_restorable(task: str, copies: int, seed: int = 0) -> list[MujocoSimulat
 
     The second is seen by trying: one copy has to repeat, bit by bit, what another did from a state of the other's.
     """
-    from gymnasium.envs.mujoco.mujoco_env import MujocoEnv
-
-    envs = [make_gymnasium(task) for _ in range(max(2, copies))]
-    if not isinstance(envs[0].unwrapped, MujocoEnv):
+    try:
+        envs = [make_gymnasium(task) for _ in range(max(2, copies))]
+    except InputError as error:
+        if "imageio" not in str(error):
+            raise
+        raise InputError(f"Gymnasium makes {task} only where imageio is installed: install ppo-dap[video]") from error
+    if not _is_mujoco(envs[0]):
         for env in envs:
             env.close()
         return None
@@ -82,6 +86,14 @@ def make_restorable(task: str, copies: int, seed: int = 0) -> list[MujocoSimulat
     space = envs[0].action_space
     actions = np.random.default_rng(seed).uniform(space.low, space.high, (2 * PROBE_STEPS, len(space.low)))
     return simulators[:copies] if repeats(simulators[0], simulators[1], actions.astype(space.dtype)) else None
+
+
+def _is_mujoco(env: Any) -> bool:
+    try:
+        from gymnasium.envs.mujoco.mujoco_env import MujocoEnv
+    except ImportError:  # it needs imageio: whatever was made without it is no task of MuJoCo's
+        return False
+    return isinstance(env.unwrapped, MujocoEnv)
 
 
 def repeats(one: Restorable, other: Restorable, actions: Float[np.ndarray, "steps act"]) -> bool:

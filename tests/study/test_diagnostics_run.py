@@ -1,0 +1,171 @@
+"""The diagnostics from end to end, on a run of a few iterations."""
+
+import json
+import shutil
+import sys
+from types import ModuleType
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ppo_dap
+from ppo_dap.cli import main
+from ppo_dap.dap.guidance import energy_weights
+from ppo_dap.dap.proposals import gaussian_proxy
+from ppo_dap.errors import InputError
+from ppo_dap.study.guided_run import load_guided
+from ppo_dap.study.reliability_report import FALLBACK, print_reliability, reliability
+
+SMALL = {
+    "num_envs": 4, "rollout_steps": 128, "minibatch_size": 32, "num_epochs": 1, "hidden_size": 8, "q_hidden_size": 8,
+    "num_proposals": 5, "sampler_steps": 3, "eval_episodes": 2, "eval_every": 128, "tensorboard": False, "steps": 384,
+    "alpha_max": 5.0, "guidance_cap": 1.0, "pin_core": False,
+}  # fmt: skip
+QUICK = {"states": 4, "rollouts": 2, "horizon": 6}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Folder with a prior, another one, and a run of each of two methods."""
+    folder = tmp_path_factory.mktemp("made")
+    logs = ppo_dap.load_logs("hopper-medium")
+    for name, episodes in (("prior", range(6)), ("other", range(6, 12))):
+        fitted = logs.select(episodes)
+        ppo_dap.fit_prior(fitted, width=16, max_steps=20, chunk_steps=20, batch_size=64).save(folder / name)
+    ppo_dap.train("Hopper-v5", "ppo-dap", prior=folder / "prior", out=folder / "run", progress=False, **SMALL)
+    plain = {name: value for name, value in SMALL.items() if name not in ("alpha_max", "guidance_cap")}
+    ppo_dap.train("Hopper-v5", "ppo", out=folder / "plain", progress=False, **plain)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def without_video(monkeypatch):
+    """Gymnasium's MuJoCo tasks import a video writer that need not be there: nothing here renders."""
+    monkeypatch.setitem(sys.modules, "imageio", ModuleType("imageio"))
+
+
+@pytest.fixture(scope="module")
+def guided(made):
+    return load_guided(made / "run", made / "prior")
+
+
+@pytest.fixture(scope="module")
+def observations():
+    return ppo_dap.load_logs("hopper-medium").observations[:12].astype(np.float32)
+
+
+def test_the_checkpoint_is_the_runs_end(made, guided, observations):
+    assert guided.state.env_steps == guided.run.metrics[-1]["env_steps"]
+    assert guided.policy(observations) == pytest.approx(guided.run.policy(observations), abs=1e-6)
+    assert guided.scoring.reward_std == guided.state.reward_scale.std > 0
+
+
+def test_q_reads_each_pair_on_its_own(guided, observations):
+    actions = np.random.default_rng(0).uniform(-1, 1, (12, 4, 3)).astype(np.float32)
+    found = guided.q(observations, actions)
+    assert found.shape == (12, 4)
+    assert guided.q(observations[3:4], actions[3:4, 2:3])[0, 0] == pytest.approx(found[3, 2], abs=1e-6)
+    assert np.ptp(found, axis=1).min() > 0
+
+
+def test_candidates_belong_to_their_states_and_guidance_raises_their_q(guided, observations):
+    steered, free = (guided.candidates(observations, on, seed=0) for on in (True, False))
+    assert steered.shape == free.shape == (12, 5, 3)
+    assert guided.q(observations, steered).mean() > guided.q(observations, free).mean()
+    # What is called without noise in the choice of states has them in their order: each alone gives the same spread.
+    mean, _ = gaussian_proxy(jnp.asarray(free), 0.1)
+    assert np.asarray(mean).shape == (12, 3)
+    far = observations.copy()
+    far[7] += 5.0
+    moved = np.abs(guided.candidates(far, False, seed=0) - free).max((1, 2))
+    assert moved.argmax() == 7
+    assert np.delete(moved, 7).max() < 1e-4 < moved[7]
+
+
+def test_energy_weights_are_eq_7s_with_the_runs_numbers(guided):
+    q = np.random.default_rng(0).standard_normal((6, 5))
+    wanted = np.exp(guided.beta * q / max(float(guided.guide.q_spread), 1e-6))
+    assert guided.beta == 1.0
+    assert guided.energy_weights(q) == pytest.approx(wanted / wanted.sum(1, keepdims=True), rel=1e-3, abs=1e-6)
+    assert guided.energy_weights(q) == pytest.approx(
+        np.asarray(energy_weights(jnp.asarray(q), jnp.asarray(1.0), guided.guide.q_spread, jnp.ones((6, 5), bool))),
+        abs=1e-5,
+    )
+    chosen, drawn = guided.draw(np.eye(5)[[0, 1, 2, 3, 4, 0]].astype(np.float32), seed=0)
+    assert (chosen == np.array([[0], [1], [2], [3], [4], [0]])).all()
+    assert (drawn["ess"], drawn["acceptance"]) == pytest.approx((1.0, 0.2))
+
+
+def test_the_report(made, capsys, tmp_path):
+    found = reliability(made / "run", made / "prior", **QUICK)
+    report, pairs = found.report, found.pairs
+    assert pairs.q.shape == pairs.g.shape == (4, 11)
+    assert pairs.returns.shape == (4, 11, 2)
+    assert report["monte_carlo"]
+    assert report["weighting"]["largest_difference_by_advantage"] < 1e-4
+    assert report["q"]["proposals"]["mae"] == pytest.approx(np.abs(pairs.q - pairs.g)[:, :5].mean())
+    for name in ("rho", "mae", "bias"):  # Q - V is Q within a state
+        assert report["advantage"]["all"][name] == pytest.approx(report["q"]["all"][name])
+    assert report["returns"]["policy"] == pytest.approx(pairs.g[:, 10].mean())
+    assert 1 <= report["weighting"]["ess"] <= 5
+    again = reliability(made / "run", made / "prior", **QUICK).pairs
+    assert np.array_equal(again.g, pairs.g)
+    options = ["--prior", str(made / "prior"), "--states", "4", "--rollouts", "2", "--horizon", "6"]
+    figure = tmp_path / "q.png"
+    assert main(["reliability", str(made / "run"), *options, "--png", str(figure), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["q"]["all"]["mae"] == report["q"]["all"]["mae"]
+    assert printed["q"]["policy"]["rho"] is None
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    print_reliability(report)
+    assert "one action a state" in capsys.readouterr().out
+
+
+def test_a_task_that_cannot_be_restored_is_read_from_its_trajectory(made, monkeypatch, capsys):
+    monkeypatch.setattr("ppo_dap.study.reliability_report.make_restorable", lambda *_: None)
+    found = reliability(made / "run", made / "prior", **QUICK)
+    assert not found.report["monte_carlo"]
+    assert found.pairs.q.shape == (128, 1)
+    assert found.report["q"]["all"]["rho_states"] == 0
+    assert np.isfinite(found.report["q"]["all"]["rho_pooled"])
+    print_reliability(found.report)
+    assert FALLBACK in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("run", "prior", "options", "words"),
+    [
+        ("plain", "prior", {}, "a run of ppo: it has no Q head"),
+        ("run", "other", {}, "fitted to other logs"),
+        ("run", "prior", {"states": 0}, "states 0 must be at least 1"),
+        ("run", "prior", {"horizon": 0}, "horizon 0 must be at least 1"),
+    ],
+)
+def test_what_cannot_work(made, run, prior, options, words):
+    with pytest.raises(InputError, match=words):
+        reliability(made / run, made / prior, **{**QUICK, **options})
+
+
+def test_a_missing_checkpoint(made, tmp_path):
+    shutil.copytree(made / "run", tmp_path / "run")
+    (tmp_path / "run" / "checkpoints" / "best.safetensors").unlink()
+    with pytest.raises(InputError, match="no checkpoint file"):
+        load_guided(tmp_path / "run", made / "prior", "best")
+
+
+@pytest.mark.parametrize("run", ["run", "plain"])
+def test_bound_of_a_real_run(made, run, capsys, tmp_path):
+    figure = tmp_path / "bound.png"
+    assert main(["bound", str(made / run), "--json", "--png", str(figure)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["reward_std"] > 0
+    reading = report["readings"]["evaluation"]
+    assert list(reading["constants"]) == (["c1", "c2", "c3"] if run == "run" else ["c1"])
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["q.jpg", "nowhere/q.png"])
+def test_a_picture_that_cannot_be_written_is_told_first(made, name, tmp_path, capsys):
+    assert main(["bound", str(made / "run"), "--png", str(tmp_path / name)]) == 2
+    assert "png" in capsys.readouterr().err
