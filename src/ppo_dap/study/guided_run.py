@@ -6,7 +6,7 @@ Whatever of training and of the guide a diagnostic needs is called here, and now
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +19,7 @@ from ppo_dap import config as configs
 from ppo_dap.config import Config
 from ppo_dap.dap.guidance import beta_schedule, effective_sample_size, energy_weights, top_k_mask
 from ppo_dap.dap.guide import GuideState, Visited, make_proposals
-from ppo_dap.dap.proposals import ProposalDraws, acceptance, resample
+from ppo_dap.dap.proposals import ProposalDraws, Proposals, acceptance, resample
 from ppo_dap.errors import InputError
 from ppo_dap.methods import get_method
 from ppo_dap.nets.critic import q_features
@@ -135,11 +135,15 @@ class GuidedRun:
         return np.asarray(advantages, np.float64)[:, 0]
 
 
-def _propose(guided: GuidedRun, visited: Visited, draws: ProposalDraws, config: Config):
+def _propose(guided: GuidedRun, visited: Visited, draws: ProposalDraws, config: Config) -> Proposals:
     """The one call of the guide: its proposals on all of `visited`."""
     proposer = guided.guide.proposer(guided.prior.denoiser, guided.state.learner.ppo.critic)
-    propose = jax.jit(partial(make_proposals, config=config, diffusion=guided.prior.config))
-    return propose(proposer, visited, jnp.zeros(()), draws).proposals
+    return _make_proposals(
+        proposer, visited, jnp.zeros(()), draws, config=config, diffusion=guided.prior.config
+    ).proposals
+
+
+_make_proposals = jax.jit(make_proposals, static_argnames=("config", "diffusion"))
 
 
 def load_guided(
