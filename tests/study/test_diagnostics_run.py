@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import sys
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +19,8 @@ from ppo_dap.errors import InputError
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 from ppo_dap.priors.prior import DiffusionPrior
 from ppo_dap.study.guided_run import load_guided
-from ppo_dap.study.reliability_report import FALLBACK, print_reliability, reliability
+from ppo_dap.study.reliability_report import FALLBACK, Pairs, describe_pairs, print_reliability, reliability
+from test_docs import command_fault, commands
 
 SMALL: Any = {
     "num_envs": 4, "rollout_steps": 128, "minibatch_size": 32, "num_epochs": 1, "hidden_size": 8, "q_hidden_size": 8,
@@ -142,13 +144,23 @@ def test_a_task_that_cannot_be_restored_is_read_from_its_trajectory(made, monkey
     [
         ("plain", "prior", {}, "a run of ppo: it has no Q head"),
         ("run", "other", {}, "fitted to other logs"),
-        ("run", "prior", {"states": 0}, "states 0 must be at least 1"),
+        ("run", "prior", {"states": 1}, "states 1 must be at least 2"),
         ("run", "prior", {"horizon": 0}, "horizon 0 must be at least 1"),
     ],
 )
 def test_what_cannot_work(made, run, prior, options, words):
     with pytest.raises(InputError, match=words):
         reliability(made / run, made / prior, **{**QUICK, **options})
+
+
+def test_two_states_are_enough():
+    q = np.arange(6.0).reshape(2, 3)
+    pairs = Pairs(q, q[..., None] + 1, q.mean(1), {"policy": slice(2, 3)})
+    found = describe_pairs(pairs)
+    assert found["q"]["all"]["bias"] == pytest.approx(-1)
+    assert found["q"]["policy"]["rho_states"] == 0
+    assert np.isnan(found["rank_ceiling"]["all"])
+    assert np.isfinite(found["calibration"]["isotonic"]["mae"])
 
 
 def test_a_missing_checkpoint(made, tmp_path):
@@ -166,6 +178,12 @@ def test_bound_of_a_real_run(made, capsys, tmp_path):
     assert list(report["readings"]["evaluation"]["constants"]) == ["c1", "c2", "c3"]
     assert report["readings"]["evaluation"]["spans"] == 3
     assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_commands_in_the_document_parse():
+    text = (Path(__file__).parents[2] / "docs" / "diagnostics.md").read_text()
+    assert len(commands(text)) == 2
+    assert [fault for line in commands(text) if (fault := command_fault(line))] == []
 
 
 @pytest.mark.parametrize("name", ["q.jpg", "nowhere/q.png"])

@@ -1,33 +1,41 @@
 """Simulators that go back: the same state and actions give the same bits, and what cannot do that is not trusted."""
 
+import itertools
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
+from ppo_dap.errors import InputError
 from ppo_dap.tasks.catalogue import make_gymnasium
 from ppo_dap.tasks.restore import MujocoSimulator, Restorable, make_restorable, repeats
 
 pytestmark = pytest.mark.usefixtures("without_video")
 
 
-class Forgetful(HopperEnv):
-    """A MuJoCo task whose reward counts the steps of the episode: no state of MuJoCo's says how many."""
+def forgetful(task):
+    """A MuJoCo task whose reward counts the steps that were taken: no state of MuJoCo's says how many."""
+    env, counted = make_gymnasium(task), itertools.count()
+    step = env.unwrapped.step
 
-    counted = 0
+    def counting(action):
+        observation, reward, *rest = step(action)
+        return observation, reward + next(counted), *rest
 
-    def step(self, action):
-        self.counted += 1
-        observation, reward, *rest = super().step(action)
-        return observation, reward + self.counted, *rest
+    env.unwrapped.step = counting
+    return env
 
 
-class Randomised(HopperEnv):
-    """A MuJoCo task whose body weighs something else in each episode."""
+def randomised(task):
+    """A MuJoCo task whose body weighs something else in each copy."""
+    env = make_gymnasium(task)
+    model: Any = env.unwrapped.model
+    model.body_mass[1:] *= next(WEIGHTS)
+    return env
 
-    def reset_model(self):
-        self.model.body_mass[1:] *= self.np_random.uniform(0.5, 2.0)
-        return super().reset_model()
+
+WEIGHTS = itertools.count(1)
 
 
 def copies(*arguments, **options):
@@ -83,12 +91,25 @@ def test_tasks_without_mujoco_cannot_be_restored():
     assert make_restorable("Pendulum-v1", 2) is None
 
 
-@pytest.mark.parametrize("fault", [Forgetful, Randomised])
+@pytest.mark.parametrize("fault", [forgetful, randomised])
 def test_a_task_that_keeps_more_than_is_saved_is_found(fault, monkeypatch):
-    monkeypatch.setattr("ppo_dap.tasks.restore.make_gymnasium", lambda task: fault())
+    monkeypatch.setattr("ppo_dap.tasks.restore.make_gymnasium", fault)
     assert make_restorable("Hopper-v5", 2) is None
-    monkeypatch.setattr("ppo_dap.tasks.restore.make_gymnasium", lambda task: HopperEnv())
+    monkeypatch.setattr("ppo_dap.tasks.restore.make_gymnasium", make_gymnasium)
     assert len(copies("Hopper-v5", 2)) == 2
+
+
+@pytest.mark.parametrize(
+    ("cause", "told"),
+    [("No module named 'imageio'", r"install ppo-dap\[video\]"), ("no such task", "no such task")],
+)
+def test_why_a_task_cannot_be_made(cause, told, monkeypatch):
+    def fail(task):
+        raise InputError(f"task {task!r} cannot be made: {cause}")
+
+    monkeypatch.setattr("ppo_dap.tasks.restore.make_gymnasium", fail)
+    with pytest.raises(InputError, match=told):
+        make_restorable("Hopper-v5", 2)
 
 
 def test_positions_and_velocities_alone_are_not_enough():

@@ -65,9 +65,10 @@ def reliability(
 
     Raises `InputError` for a run that has no Q, another prior than its own, or numbers that cannot work.
     """
-    for name, number in (("states", states), ("rollouts", rollouts), ("horizon", horizon)):
-        if number is not None and number < 1:
-            raise InputError(f"{name} {number} must be at least 1")
+    # Two states at least: a calibration is judged on states that it was not fitted to.
+    for name, number, least in (("states", states, 2), ("rollouts", rollouts, 1), ("horizon", horizon, 1)):
+        if number is not None and number < least:
+            raise InputError(f"{name} {number} must be at least {least}")
     guided = load_guided(folder, prior, checkpoint)
     horizon = horizon or default_horizon(guided.config.ppo.gamma)
     copies = make_restorable(guided.spec.task, rollouts, seed)

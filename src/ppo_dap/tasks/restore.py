@@ -76,16 +76,16 @@ def make_restorable(task: str, copies: int, seed: int = 0) -> list[MujocoSimulat
         if "imageio" not in str(error):
             raise
         raise InputError(f"Gymnasium makes {task} only where imageio is installed: install ppo-dap[video]") from error
-    if not _is_mujoco(envs[0]):
-        for env in envs:
-            env.close()
-        return None
-    for i, env in enumerate(envs):
-        env.reset(seed=seed + i)
-    simulators = [MujocoSimulator(env) for env in envs]
-    space = envs[0].action_space
-    actions = np.random.default_rng(seed).uniform(space.low, space.high, (2 * PROBE_STEPS, len(space.low)))
-    return simulators[:copies] if repeats(simulators[0], simulators[1], actions.astype(space.dtype)) else None
+    if _is_mujoco(envs[0]):
+        for i, env in enumerate(envs):
+            env.reset(seed=seed + i)
+        simulators, space = [MujocoSimulator(env) for env in envs], envs[0].action_space
+        actions = np.random.default_rng(seed).uniform(space.low, space.high, (2 * PROBE_STEPS, len(space.low)))
+        if repeats(simulators[0], simulators[1], actions.astype(space.dtype)):
+            return simulators[:copies]
+    for env in envs:
+        env.close()
+    return None
 
 
 def _is_mujoco(env: Any) -> bool:
