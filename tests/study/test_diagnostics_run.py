@@ -19,7 +19,14 @@ from ppo_dap.errors import InputError
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 from ppo_dap.priors.prior import DiffusionPrior
 from ppo_dap.study.guided_run import load_guided
-from ppo_dap.study.reliability_report import FALLBACK, Pairs, describe_pairs, print_reliability, reliability
+from ppo_dap.study.reliability_report import (
+    FALLBACK,
+    Pairs,
+    describe_pairs,
+    print_reliability,
+    reliability,
+    reliability_figure,
+)
 from test_docs import command_fault, commands
 
 SMALL: Any = {
@@ -104,7 +111,7 @@ def test_energy_weights_are_eq_7s_with_the_runs_numbers(guided):
     assert (drawn["ess"], drawn["acceptance"]) == pytest.approx((1.0, 0.2))
 
 
-def test_the_report(made, capsys, tmp_path):
+def test_the_report(made, guided, capsys, tmp_path):
     found = reliability(made / "run", made / "prior", **QUICK)
     report, pairs = found.report, found.pairs
     assert pairs.q.shape == pairs.g.shape == (4, 11)
@@ -114,6 +121,11 @@ def test_the_report(made, capsys, tmp_path):
     assert report["q"]["proposals"]["mae"] == pytest.approx(np.abs(pairs.q - pairs.g)[:, :5].mean())
     for name in ("rho", "mae", "bias"):  # Q - V is Q within a state
         assert report["advantage"]["all"][name] == pytest.approx(report["q"]["all"][name])
+    weights = guided.energy_weights(pairs.q[:, :5])
+    by_hand = np.mean([np.dot(w, g) for w, g in zip(weights, pairs.g[:, :5], strict=True)])
+    assert report["returns"]["reweighted"] == pytest.approx(by_hand)
+    best = [g[i] for i, g in zip(pairs.q[:, :5].argmax(1), pairs.g, strict=True)]
+    assert report["returns"]["highest_q"] == pytest.approx(np.mean(best))
     assert report["returns"]["policy"] == pytest.approx(pairs.g[:, 10].mean())
     assert 1 <= report["weighting"]["ess"] <= 5
     options = ["--prior", str(made / "prior"), "--states", "4", "--rollouts", "2", "--horizon", "6"]
@@ -128,7 +140,7 @@ def test_the_report(made, capsys, tmp_path):
     assert "one action a state" in capsys.readouterr().out
 
 
-def test_a_task_that_cannot_be_restored_is_read_from_its_trajectory(made, monkeypatch, capsys):
+def test_a_task_that_cannot_be_restored_is_read_from_its_trajectory(made, monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("ppo_dap.study.reliability_report.make_restorable", lambda *_: None)
     found = reliability(made / "run", made / "prior", **QUICK)
     assert not found.report["monte_carlo"]
@@ -137,6 +149,10 @@ def test_a_task_that_cannot_be_restored_is_read_from_its_trajectory(made, monkey
     assert np.isfinite(found.report["q"]["all"]["rho_pooled"])
     print_reliability(found.report)
     assert FALLBACK in capsys.readouterr().out
+    assert "returns" not in found.report
+    assert 1 <= found.report["weighting"]["ess"] <= 5
+    reliability_figure(found, tmp_path / "q.png")
+    assert (tmp_path / "q.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

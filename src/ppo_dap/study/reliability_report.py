@@ -88,18 +88,19 @@ def reliability(
         "states": len(trajectory.kept),
         "monte_carlo": copies is not None,
     }
+    observations, (actions, groups) = trajectory.observations[trajectory.kept], _actions(guided, trajectory, seed)
+    q, values = guided.q(observations, actions), guided.values(observations)
+    weights, weighting = _weighting(guided, q, values, groups, seed)
     if copies is None:
         found = _visited_pairs(guided, trajectory)
-        return Reliability(
-            head | {"note": FALLBACK} | describe_pairs(found, seed) | _visited(guided, trajectory), found
-        )
-    actions, groups = _actions(guided, trajectory, seed)
+        parts = {"note": FALLBACK} | describe_pairs(found, seed) | weighting | _visited(guided, trajectory)
+        return Reliability(head | parts, found)
     numbers = (guided.scoring, horizon, seed, progress)
     returns = monte_carlo_returns(copies, guided.policy, trajectory.saved, actions, *numbers)
-    observations = trajectory.observations[trajectory.kept]
-    found = Pairs(guided.q(observations, actions), returns, guided.values(observations), groups)
+    found = Pairs(q, returns, values, groups)
     head |= {"rollouts": rollouts, "horizon": horizon}
-    parts = describe_pairs(found, seed) | _weighting(guided, found, seed) | _visited(guided, trajectory, found)
+    earned = {"returns": _mean_returns(found, weights)}
+    parts = describe_pairs(found, seed) | weighting | earned | _visited(guided, trajectory, found)
     return Reliability(head | parts, found)
 
 
@@ -136,28 +137,34 @@ def describe_pairs(pairs: Pairs, seed: int = 0) -> dict[str, Any]:
     }
 
 
-def _weighting(guided: GuidedRun, pairs: Pairs, seed: int) -> dict[str, Any]:
-    """What Eq. 7 makes of Q: how even and how greedy the weights are, and whether they raise the real return."""
-    part = pairs.groups["proposals"]
-    q, g, free = pairs.q[:, part], pairs.g[:, part], pairs.groups["unguided"]
-    weights = guided.energy_weights(q)
+def _weighting(
+    guided: GuidedRun, q: Float[np.ndarray, "n k"], values: Float[np.ndarray, " n"], groups: dict[str, slice], seed: int
+) -> tuple[Float[np.ndarray, "n proposals"], dict[str, Any]]:
+    """Eq. 7's weights of the guided candidates, and how even and how greedy they are."""
+    steered, free = q[:, groups["proposals"]], q[:, groups["unguided"]]
+    weights = guided.energy_weights(steered)
     chosen, drawn = guided.draw(weights, seed)
-    by_advantage = guided.energy_weights(q - pairs.values[:, None])
-    return {
+    by_advantage = guided.energy_weights(steered - values[:, None])
+    return weights, {
         "weighting": {
             "beta": guided.beta,
             **drawn,
-            "high_q_hit_rate": measures.high_q_hit_rate(q, np.take_along_axis(q, chosen, axis=1)),
-            "high_q_hit_rate_over_unguided": measures.high_q_hit_rate(pairs.q[:, free], q),
+            "high_q_hit_rate": measures.high_q_hit_rate(steered, np.take_along_axis(steered, chosen, axis=1)),
+            "high_q_hit_rate_over_unguided": measures.high_q_hit_rate(free, steered),
             "largest_difference_by_advantage": float(np.abs(weights - by_advantage).max()),
-        },
-        "returns": {
-            "policy": float(pairs.g[:, pairs.groups["policy"]].mean()),
-            "unguided": float(pairs.g[:, free].mean()),
-            "proposals": float(g.mean()),
-            "reweighted": float((weights * g).sum(1).mean()),
-            "highest_q": float(np.take_along_axis(g, q.argmax(1)[:, None], axis=1).mean()),
-        },
+        }
+    }
+
+
+def _mean_returns(pairs: Pairs, weights: Float[np.ndarray, "n proposals"]) -> dict[str, float]:
+    """Whether guidance raises the real return: G by where the action comes from."""
+    q, g = (x[:, pairs.groups["proposals"]] for x in (pairs.q, pairs.g))
+    return {
+        "policy": float(pairs.g[:, pairs.groups["policy"]].mean()),
+        "unguided": float(pairs.g[:, pairs.groups["unguided"]].mean()),
+        "proposals": float(g.mean()),
+        "reweighted": float((weights * g).sum(1).mean()),
+        "highest_q": float(np.take_along_axis(g, q.argmax(1)[:, None], axis=1).mean()),
     }
 
 
@@ -199,14 +206,14 @@ def print_reliability(report: Mapping[str, Any]) -> None:
         )
     for name, m in r["calibration"].items():
         print(f"calibration {name}: MAE {m['mae']:.3g}, ECE {m['ece']:.3g} on held-out states")
-    if "weighting" in r:
-        w, g = r["weighting"], r["returns"]
-        print(
-            f"energy weights: beta {w['beta']:.2f}, ESS {w['ess']:.1f}, acceptance {w['acceptance']:.2f}, high-Q hit "
-            f"rate {w['high_q_hit_rate']:.2f} (guided among unguided {w['high_q_hit_rate_over_unguided']:.2f}); with "
-            f"Q - V for Q they differ by at most {w['largest_difference_by_advantage']:.1g}"
-        )
-        print("mean return of: " + ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in g.items()))
+    w = r["weighting"]
+    print(
+        f"energy weights: beta {w['beta']:.2f}, ESS {w['ess']:.1f}, acceptance {w['acceptance']:.2f}, high-Q hit rate "
+        f"{w['high_q_hit_rate']:.2f} (guided among unguided {w['high_q_hit_rate_over_unguided']:.2f}); with Q - V "
+        f"they differ by at most {w['largest_difference_by_advantage']:.1g}"
+    )
+    if r["monte_carlo"]:
+        print("mean return of: " + ", ".join(f"{k.replace('_', ' ')} {value:.3f}" for k, value in r["returns"].items()))
     print("rank correlations over visited pairs, one action a state:")
     for name, value in r["visited"].items():
         if name != "pairs":
