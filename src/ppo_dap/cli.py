@@ -166,9 +166,29 @@ def _about_runs(command: Command) -> None:
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
 
+    _diagnostics(command)
     _collect_options(command)
     sub = command("methods", commands.methods, "the methods and what each of them uses (Table 3)")
     sub.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _diagnostics(command: Command) -> None:
+    text = "how far a run's Q can be trusted (5.7): ranks, errors, calibration"
+    sub = command("reliability", commands.reliability, text)
+    sub.add_argument("folder", metavar="RUN", help="run folder of a method with a prior")
+    sub.add_argument("--prior", required=True, metavar="FILE", help="the prior that it was trained with")
+    sub.add_argument("--states", type=_positive_count, default=64, help="visited states (default: %(default)s)")
+    sub.add_argument("--rollouts", type=_positive_count, default=8, help="of each action (default: %(default)s)")
+    sub.add_argument("--horizon", type=_positive_count, help="steps of one (default: until gamma^H is below 0.05)")
+    sub.add_argument("--checkpoint", choices=("last", "best"), default="last", help="(default: %(default)s)")
+    sub.add_argument("--seed", type=_seed, default=0, help="of states, proposals and rollouts (default: 0)")
+    sub.add_argument("--json", action="store_true", help="print JSON")
+    sub.add_argument("--png", metavar="FILE", help="draw Q against the returns to this .png as well")
+
+    sub = command("bound", commands.bound, "the terms of the performance bound (Eq. 14) over a run's iterations")
+    sub.add_argument("folder", metavar="RUN", help="run folder")
+    sub.add_argument("--json", action="store_true", help="print JSON")
+    sub.add_argument("--png", metavar="FILE", help="draw the terms by iteration to this .png as well")
 
 
 def _collect_options(command: Command) -> None:

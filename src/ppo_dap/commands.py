@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -235,6 +236,51 @@ def audit(options: argparse.Namespace) -> int:
         text = "strictly on-policy (Definition 1)" if strictly else "NOT strictly on-policy"
         print(f"verdict: {text}" + (f", as method {run.config['method']} is declared" if declared > strictly else ""))
     return 0 if declared else 1
+
+
+def reliability(options: argparse.Namespace) -> int:
+    """How far a run's Q can be trusted (5.7)."""
+    prepare_jax()
+    from ppo_dap.study import reliability_report as study
+    from ppo_dap.study.diagnostic_figures import require_png
+
+    png = None if options.png is None else require_png(options.png)
+    names = ("states", "rollouts", "horizon", "checkpoint", "seed")
+    given = {name: getattr(options, name) for name in names}
+    found = study.reliability(options.folder, options.prior, **given, progress=study.show_progress(options.states))
+    if options.json:
+        print(json.dumps(without_nan(found.report)))
+    else:
+        study.print_reliability(found.report)
+    if png is not None:
+        study.reliability_figure(found, png)
+    return 0
+
+
+def bound(options: argparse.Namespace) -> int:
+    """The terms of Eq. 14 by iteration."""
+    prepare_jax()
+    from ppo_dap.study import bound as study
+    from ppo_dap.study.diagnostic_figures import require_png
+
+    png = None if options.png is None else require_png(options.png)
+    found = study.bound(options.folder)
+    if options.json:
+        print(json.dumps(without_nan(found.report)))
+    else:
+        study.print_bound(found.report)
+    if png is not None:
+        study.bound_figure(found, png)
+    return 0
+
+
+def without_nan(value: Any) -> Any:
+    """`value` with None for every number that is none: JSON has no NaN."""
+    if isinstance(value, Mapping):
+        return {name: without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [without_nan(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def summary(options: argparse.Namespace) -> int:
