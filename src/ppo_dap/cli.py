@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import ast
-import dataclasses
-import functools
-import inspect
-import itertools
-import math
 import sys
-import typing
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from ppo_dap import commands
-from ppo_dap import config as configs
+from ppo_dap.commands import runs, stages
+from ppo_dap.commands.options import (
+    config_options,
+    filter_option,
+    logs_option,
+    number_of_0_or_more,
+    positive_count,
+    positive_number,
+    prior_options,
+    seed,
+)
 from ppo_dap.errors import InputError, PPODAPError, unknown
-from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
+from ppo_dap.prior_config import FITTED
 
 
 class Parser(argparse.ArgumentParser):
@@ -90,32 +92,32 @@ Command = Callable[[str, Callable[[argparse.Namespace], int], str], Parser]
 
 
 def _from_logs_to_runs(command: Command) -> None:
-    sub = command("quickstart", commands.quickstart, "the main job on the shipped sample, in a few minutes")
+    sub = command("quickstart", stages.quickstart, "the main job on the shipped sample, in a few minutes")
     sub.add_argument(
         "--out", default="quickstart", metavar="FOLDER", help="where everything goes (default: %(default)s)"
     )
 
-    sub = command("check-logs", commands.check_logs, "say whether logs can be used, and what is odd about them")
-    _logs_option(sub, True)
+    sub = command("check-logs", stages.check_logs, "say whether logs can be used, and what is odd about them")
+    logs_option(sub, True)
     sub.add_argument("--task", metavar="ID", help="task to check dimensions and bounds against")
     sub.add_argument("--json", action="store_true", help="print the findings as JSON")
     sub.add_argument("--html", metavar="FILE", help="write the findings and pictures to one .html file as well")
 
-    sub = command("pretrain", commands.pretrain, "Stage I: fit a prior to logs")
-    _logs_option(sub, True)
+    sub = command("pretrain", stages.pretrain, "Stage I: fit a prior to logs")
+    logs_option(sub, True)
     sub.add_argument("--task", metavar="ID", help="task of the logs, where they do not say (gives the action bounds)")
     for bound in ("low", "high"):
         text = f"{bound}est action, a number or one for each action (default: the task's, or as the logs say)"
         sub.add_argument(f"--action-{bound}", nargs="+", type=float, metavar="X", help=text)
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
     sub.add_argument("--kind", default="diffusion", help=f"{', '.join(FITTED)} (default: %(default)s)")
-    _filter_option(sub)
+    filter_option(sub)
     sub.add_argument("--coverage", default="wide", help="wide, medium or narrow: how much of the logs (default: wide)")
-    sub.add_argument("--seed", type=_seed, default=0, help="seed of the fit, and of the coverage (default: 0)")
+    sub.add_argument("--seed", type=seed, default=0, help="seed of the fit, and of the coverage (default: 0)")
     sub.add_argument("--quiet", action="store_true", help="print the result alone")
-    _prior_options(sub)
+    prior_options(sub)
 
-    sub = command("train", commands.train_run, "Stage II: train a method on a task")
+    sub = command("train", stages.train_run, "Stage II: train a method on a task")
     sub.add_argument(
         "--task", required=True, metavar="ID", help="a Gymnasium id, such as Hopper-v5, or package.module:Class"
     )
@@ -125,74 +127,74 @@ def _from_logs_to_runs(command: Command) -> None:
         metavar="FILE",
         help="prior that `ppo-dap pretrain` wrote, or random: the control that proposes anything",
     )
-    _logs_option(sub, False)
+    logs_option(sub, False)
     sub.add_argument("--out", required=True, metavar="FOLDER", help="run folder")
     sub.add_argument("--preset", default="paper", help="paper (Table 2) or tuned (default: %(default)s)")
     sub.add_argument("--resume", action="store_true", help="go on from the last checkpoint in --out")
     sub.add_argument("--quiet", action="store_true", help="no progress")
     sub.add_argument("--json", action="store_true", help="print the last evaluation as JSON")
-    _config_options(sub)
+    config_options(sub)
 
 
 def _about_runs(command: Command) -> None:
-    sub = command("evaluate", commands.evaluate, "returns of a run's deterministic policy")
+    sub = command("evaluate", runs.evaluate, "returns of a run's deterministic policy")
     sub.add_argument("folder", metavar="RUN", help="run folder")
     sub.add_argument("--task", metavar="ID", help="another task of the same dimensions")
-    sub.add_argument("--episodes", type=_positive_count, default=10, help="(default: %(default)s)")
-    sub.add_argument("--seed", type=_seed, default=0, help="seed of the environments (default: 0)")
+    sub.add_argument("--episodes", type=positive_count, default=10, help="(default: %(default)s)")
+    sub.add_argument("--seed", type=seed, default=0, help="seed of the environments (default: 0)")
     sub.add_argument("--video", metavar="FILE", help="film an episode of its own to this .mp4 as well")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
-    sub = command("bench", commands.bench, "what PPO and the method cost on this machine, as ratios; tens of minutes")
+    sub = command("bench", runs.bench, "what PPO and the method cost on this machine, as ratios; tens of minutes")
     sub.add_argument(
         "--task", action="append", metavar="ID", help="again for more (default: Walker2d-v5, HalfCheetah-v5)"
     )
-    sub.add_argument("--steps", type=_positive_count, default=81920, help="of each run (default: %(default)s)")
-    sub.add_argument("--repeats", type=_positive_count, default=3, help="medians are over these (default: %(default)s)")
+    sub.add_argument("--steps", type=positive_count, default=81920, help="of each run (default: %(default)s)")
+    sub.add_argument("--repeats", type=positive_count, default=3, help="medians are over these (default: %(default)s)")
     sub.add_argument("--peers", metavar="PYTHON", help="interpreter that has the peers: see `make bench-peers`")
     sub.add_argument(
         "--sweep", metavar="CSV", help="instead: cost against each knob of the method, as a table and figure"
     )
     sub.add_argument("--json", metavar="FILE", help="write everything to FILE as well")
 
-    sub = command("audit", commands.audit, "verdict on a run by Definition 1; exit code 1 on a violation")
+    sub = command("audit", runs.audit, "verdict on a run by Definition 1; exit code 1 on a violation")
     sub.add_argument("folder", metavar="RUN", help="run folder")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
-    sub = command("summary", commands.summary, "ALC, return, cost and verdict of runs beside their paired PPO")
+    sub = command("summary", runs.summary, "ALC, return, cost and verdict of runs beside their paired PPO")
     sub.add_argument("folders", nargs="+", metavar="RUN", help="run folders")
     sub.add_argument(
-        "--epochs", type=_positive_number, default=40.0, help="T of ALC@T, in 5k steps (default: %(default)s)"
+        "--epochs", type=positive_number, default=40.0, help="T of ALC@T, in 5k steps (default: %(default)s)"
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
 
     _diagnostics(command)
     _collect_options(command)
-    sub = command("methods", commands.methods, "the methods and what each of them uses (Table 3)")
+    sub = command("methods", runs.methods, "the methods and what each of them uses (Table 3)")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _diagnostics(command: Command) -> None:
     text = "how far a run's Q can be trusted (5.7): ranks, errors, calibration"
-    sub = command("reliability", commands.reliability, text)
+    sub = command("reliability", runs.reliability, text)
     sub.add_argument("folder", metavar="RUN", help="run folder of a method with a prior")
     sub.add_argument("--prior", required=True, metavar="FILE", help="the prior that it was trained with")
-    sub.add_argument("--states", type=_positive_count, default=64, help="visited states (default: %(default)s)")
-    sub.add_argument("--rollouts", type=_positive_count, default=8, help="of each action (default: %(default)s)")
-    sub.add_argument("--horizon", type=_positive_count, help="steps of one (default: until gamma^H is below 0.05)")
+    sub.add_argument("--states", type=positive_count, default=64, help="visited states (default: %(default)s)")
+    sub.add_argument("--rollouts", type=positive_count, default=8, help="of each action (default: %(default)s)")
+    sub.add_argument("--horizon", type=positive_count, help="steps of one (default: until gamma^H is below 0.05)")
     sub.add_argument("--checkpoint", choices=("last", "best"), default="last", help="(default: %(default)s)")
-    sub.add_argument("--seed", type=_seed, default=0, help="of states, proposals and rollouts (default: 0)")
+    sub.add_argument("--seed", type=seed, default=0, help="of states, proposals and rollouts (default: 0)")
     sub.add_argument("--json", action="store_true", help="print JSON")
     sub.add_argument("--png", metavar="FILE", help="draw Q against the returns to this .png as well")
 
-    sub = command("bound", commands.bound, "the terms of the performance bound (Eq. 14) over a run's iterations")
+    sub = command("bound", runs.bound, "the terms of the performance bound (Eq. 14) over a run's iterations")
     sub.add_argument("folder", metavar="RUN", help="run folder")
     sub.add_argument("--json", action="store_true", help="print JSON")
     sub.add_argument("--png", metavar="FILE", help="draw the terms by iteration to this .png as well")
 
 
 def _collect_options(command: Command) -> None:
-    sub = command("collect", commands.collect, "log episodes of a run's policy, or make tiers of logs for a task")
+    sub = command("collect", stages.collect, "log episodes of a run's policy, or make tiers of logs for a task")
     sub.add_argument("folder", nargs="?", metavar="RUN", help="run folder, to log its policy")
     sub.add_argument("--task", action="append", metavar="ID", help="or train behaviour policies for it; again for more")
     sub.add_argument(
@@ -206,149 +208,19 @@ def _collect_options(command: Command) -> None:
     )
     sub.add_argument("--out", required=True, metavar="PATH", help=".npz to write; for tiers the folder they go to")
     sub.add_argument(
-        "--steps", type=_positive_count, default=100_000, help="rows at least, in whole episodes (default: %(default)s)"
+        "--steps", type=positive_count, default=100_000, help="rows at least, in whole episodes (default: %(default)s)"
     )
     sub.add_argument(
-        "--train-steps", type=_positive_count, default=1_000_000, help="of a behaviour run (default: %(default)s)"
+        "--train-steps", type=positive_count, default=1_000_000, help="of a behaviour run (default: %(default)s)"
     )
-    sub.add_argument("--seed", type=_seed, default=0, help="seed of training, environments and noise (default: 0)")
+    sub.add_argument("--seed", type=seed, default=0, help="seed of training, environments and noise (default: 0)")
     sub.add_argument(
         "--noise",
-        type=_number_of_0_or_more,
+        type=number_of_0_or_more,
         default=1.0,
         help="times the policy's own noise, for a RUN (default: %(default)s)",
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
-
-
-def _number(kind: type, right: Callable[[Any], bool], what: str) -> Callable[[str], Any]:
-    """An option's type: a number for which `right` holds."""
-
-    def parse(text: str) -> Any:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = None
-        if value is None or not right(value):
-            raise argparse.ArgumentTypeError(f"must be {what}, not {text!r}")
-        return value
-
-    return parse
-
-
-_seed = _number(int, lambda v: 0 <= v < 2**32, "a whole number from 0 to 4294967295")
-_positive_count = _number(int, lambda v: v > 0, "a whole number above 0")
-_positive_number = _number(float, lambda v: 0 < v < math.inf, "a number above 0")
-_number_of_0_or_more = _number(float, lambda v: 0 <= v < math.inf, "a number of 0 or more")
-
-
-def _column(text: str) -> tuple[str, list[str] | None]:
-    """A role and the columns that have it; none for `ROLE=`."""
-    role, equals, names = text.partition("=")
-    if not (role and equals):
-        raise argparse.ArgumentTypeError(f"must be ROLE=NAME or ROLE=NAME,NAME,..., not {text!r}")
-    return role, names.split(",") if names else None
-
-
-def _logs_option(parser: Parser, required: bool) -> None:
-    what = "shipped sample, .npz, D4RL .hdf5, .csv or .parquet table, LeRobot or Minari folder, or Minari id"
-    parser.add_argument("--logs", required=required, metavar="LOGS", help=what)
-    parser.add_argument(
-        "--columns",
-        nargs="+",
-        type=_column,
-        metavar="ROLE=NAME,...",
-        help="what a table's columns are, where their names do not say: observations, actions (names or prefixes), "
-        "episode, step, rewards, terminated, truncated, done",
-    )
-    parser.add_argument(
-        "--max-bytes",
-        type=_positive_count,
-        metavar="N",
-        help="of larger logs, episodes drawn by the seed are kept up to this (default: 256 MiB)",
-    )
-
-
-def _filter_option(parser: Parser) -> None:
-    parser.add_argument(
-        "--logs-filter",
-        type=_number(float, lambda v: 0 < v <= 1, "a number above 0 and at most 1"),
-        default=1.0,
-        metavar="SHARE",
-        help="share of the logs' rows to fit to: whole episodes, those of the highest return first (default: 1.0)",
-    )
-
-
-def _config_options(parser: Parser) -> None:
-    """A flag for every field of the config, by its name; what is not given stays with the preset."""
-    for group, cls in typing.get_type_hints(configs.Config).items():
-        _field_options(parser.add_argument_group(f"{group}: {(cls.__doc__ or '').splitlines()[0]}"), cls)
-
-
-def _prior_options(parser: Parser) -> None:
-    """A flag for every field of every kind of prior; those that several kinds have are there once."""
-    fitted, kinds = {kind: PRIOR_CONFIGS[kind] for kind in FITTED}, {}
-    for kind, cls in fitted.items():
-        for f in dataclasses.fields(cls):
-            kinds.setdefault(f.name, []).append(kind)
-    seen: set[str] = set()
-    for kind, cls in fitted.items():
-        section = parser.add_argument_group(f"{kind} prior: {(cls.__doc__ or '').splitlines()[0]}")
-        _field_options(section, cls, {name: others for name, others in kinds.items() if name not in seen})
-        seen |= {f.name for f in dataclasses.fields(cls)}
-
-
-def _field_options(section: Any, cls: type, shared: Mapping[str, Sequence[str]] | None = None) -> None:
-    """A flag for every field of a dataclass; what is not given is not in the result.
-
-    `shared` names the fields to take, and the kinds of prior that have each.
-    """
-    hints, texts = typing.get_type_hints(cls), field_docstrings(cls)
-    for f in dataclasses.fields(cls):
-        if shared is not None and f.name not in shared:
-            continue
-        others = shared[f.name] if shared is not None and len(shared[f.name]) > 1 else ()
-        defaults = {str(PRIOR_CONFIGS[kind].__dataclass_fields__[f.name].default) for kind in others} or {
-            str(f.default)
-        }
-        text = f"{texts[f.name]} (default: {' or '.join(sorted(defaults))})"
-        section.add_argument(
-            f"--{f.name.replace('_', '-')}",
-            type=functools.partial(_parse_value, hints[f.name]),
-            default=argparse.SUPPRESS,
-            metavar="X",
-            help=(text + (f" [{', '.join(others)}]" if others else "")).replace("%", "%%"),
-        )
-
-
-def field_docstrings(cls: type) -> dict[str, str]:
-    """The string below each field of a dataclass, its base's included."""
-    texts = {}
-    for part in reversed(cls.__mro__[:-1]):
-        body = ast.parse(inspect.getsource(part)).body[0].body  # type: ignore[attr-defined]
-        for statement, after in itertools.pairwise(body):
-            if isinstance(statement, ast.AnnAssign) and isinstance(after, ast.Expr):
-                texts[statement.target.id] = " ".join(ast.literal_eval(after.value).split())  # type: ignore[union-attr]
-    return texts
-
-
-def _parse_value(hint: Any, text: str) -> Any:
-    """`text` as the field's type; what is wrong with the value itself is the config's to say."""
-    kinds = typing.get_args(hint) or (hint,)
-    if typing.get_origin(hint) is typing.Literal:
-        return text
-    if type(None) in kinds and text.lower() == "none":
-        return None
-    if bool in kinds:
-        if text.lower() not in ("true", "false"):
-            raise argparse.ArgumentTypeError(f"must be true or false, not {text!r}")
-        return text.lower() == "true"
-    kind = next(k for k in kinds if k is not type(None))
-    try:
-        return kind(text.replace("_", "")) if kind is int else kind(text)
-    except ValueError:
-        right = {int: "a whole number", float: "a number"}[kind] + (" or none" if type(None) in kinds else "")
-        raise argparse.ArgumentTypeError(f"must be {right}, not {text!r}") from None
 
 
 if __name__ == "__main__":

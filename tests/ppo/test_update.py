@@ -149,7 +149,7 @@ def test_gradient_of_the_spread_is_the_score_times_the_normalised_advantage():
 # What a method adds.
 
 
-def pull(actor, added, weight):
+def pull(actor, rows, added, weight):
     """Gradient of `weight` times a loss that draws the means to 1 and the spread to nothing."""
     loss = lambda actor: weight * (jnp.mean(jnp.square(actor(added) - 1)) + actor.log_std.sum())  # noqa: E731
     return jax.grad(loss)(actor), {"seen": jnp.mean(added)}

@@ -26,7 +26,7 @@ from ppo_dap.nets.critic import q_features
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy
 from ppo_dap.ppo.gae import gae
-from ppo_dap.priors import DiffusionPrior, load_prior
+from ppo_dap.priors import Prior, load_prior
 from ppo_dap.study.monte_carlo import Scoring, Walk
 from ppo_dap.tasks import TaskSpec, describe
 from ppo_dap.training.algorithm import create_learner
@@ -43,7 +43,7 @@ class GuidedRun:
     spec: TaskSpec
     state: TrainState
     guide: GuideState
-    prior: DiffusionPrior
+    prior: Prior
 
     @cached_property
     def policy(self) -> Policy:
@@ -75,10 +75,11 @@ class GuidedRun:
     def q(
         self, observations: Float[np.ndarray, "n obs"], actions: Float[np.ndarray, "n k act"]
     ) -> Float[np.ndarray, "n k"]:
-        """Q(s, a)."""
+        """Q(s, a), as proposals see it."""
         seen = jnp.asarray(self.normalised(observations))
         features = q_features(self.state.learner.ppo.critic, self.guide.q, seen, shared=False)
-        return np.asarray(self.guide.q(features, jnp.asarray(actions, jnp.float32)), np.float64)
+        values = self.guide.q(features, jnp.asarray(actions, jnp.float32), self.config.proposals.q_pessimism)
+        return np.asarray(values if self.guide.calibration is None else self.guide.calibration(values), np.float64)
 
     def candidates(
         self, observations: Float[np.ndarray, "n obs"], guided: bool, seed: int
@@ -88,9 +89,10 @@ class GuidedRun:
         """
         steered = guided and "gradient" in self.config.proposals.guidance
         # Without energy and top_k nothing is drawn again: what comes back are the candidates themselves.
-        config = configs.replace(self.config, guidance="gradient" if steered else "none", top_k=None)
+        plain = {"top_k": None, "keep_diverse": None, "mode_seeking": 0.0}
+        config = configs.replace(self.config, guidance="gradient" if steered else "none", **plain)
         n = len(observations)
-        draws = ProposalDraws.make(np.random.default_rng([seed, 2]), n, n, self.spec.action_size, config.proposals)
+        draws = ProposalDraws.make(np.random.default_rng([seed, 2]), n, n, self.prior.network, config.proposals)
         visited = Visited(
             jnp.arange(n, dtype=jnp.int32),
             jnp.asarray(observations),
@@ -137,17 +139,16 @@ class GuidedRun:
 
 def _propose(guided: GuidedRun, visited: Visited, draws: ProposalDraws, config: Config) -> Proposals:
     """The one call of the guide: its proposals on all of `visited`."""
-    proposer = guided.guide.proposer(guided.prior.denoiser, guided.state.learner.ppo.critic)
-    return _make_proposals(
-        proposer, visited, jnp.zeros(()), draws, config=config, diffusion=guided.prior.config
-    ).proposals
+    condition = jnp.asarray(guided.prior.condition(config.proposals.prior_return))
+    proposer = guided.guide.proposer(guided.prior.network, condition, guided.state.learner.ppo.critic, None)
+    return _make_proposals(proposer, visited, jnp.zeros(()), draws, config=config).proposals
 
 
-_make_proposals = jax.jit(make_proposals, static_argnames=("config", "diffusion"))
+_make_proposals = jax.jit(make_proposals, static_argnames="config")
 
 
 def load_guided(
-    folder: str | Path, prior: DiffusionPrior | str | Path, checkpoint: Literal["last", "best"] = "last"
+    folder: str | Path, prior: Prior | str | Path, checkpoint: Literal["last", "best"] = "last"
 ) -> GuidedRun:
     """Open a run folder at a checkpoint, with the prior that it was trained with.
 
@@ -157,13 +158,13 @@ def load_guided(
     run = load_run(folder)
     if get_method(run.config["method"]).prior == "none":
         raise InputError(f"{folder} is a run of {run.config['method']}: it has no Q head, and nothing it would guide")
-    found = prior if isinstance(prior, DiffusionPrior) else load_prior(prior)
-    if not isinstance(found, DiffusionPrior) or found.logs_hash != run.config["prior_hash"]:
+    found = prior if isinstance(prior, Prior) else load_prior(prior)
+    if found.logs_hash != run.config["prior_hash"]:
         raise InputError(f"prior {prior} was fitted to other logs than the prior that {folder} was trained with")
     config = configs.replace(Config(), **run.config["config"])
     spec = describe(run.config["task"])
     sizes = spec.observation_size, spec.action_size
-    learner = create_learner(sizes, config, found.denoiser)
+    learner = create_learner(sizes, config, found.network)
     like = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
     state, _ = load_checkpoint(run.folder / "checkpoints" / f"{checkpoint}.safetensors", like)
     if state.learner.guide is None:

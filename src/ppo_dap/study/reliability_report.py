@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ppo_dap.errors import InputError
-from ppo_dap.priors import DiffusionPrior
+from ppo_dap.priors import Prior
 from ppo_dap.study import reliability as measures
 from ppo_dap.study.guided_run import GuidedRun, load_guided
 from ppo_dap.study.monte_carlo import Walk, default_horizon, monte_carlo_returns, returns_to_go, walk
@@ -51,7 +51,7 @@ class Reliability(NamedTuple):
 
 def reliability(
     folder: str | Path,
-    prior: DiffusionPrior | str | Path,
+    prior: Prior | str | Path,
     *,
     states: int = 64,
     rollouts: int = 8,

@@ -1,10 +1,9 @@
-"""What each command does with its parsed options: one call of a public function, and its result in words or JSON."""
+"""The commands that make things: logs, priors, runs."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import itertools
 import json
 import math
@@ -176,104 +175,6 @@ def _print_profile(metrics: Sequence[Mapping[str, Any]]) -> None:
             print(label.format(total=total) + ": " + ", ".join(f"{line.name} {line.share:.0%}" for line in parts))
 
 
-def evaluate(options: argparse.Namespace) -> int:
-    """Returns of a run's deterministic policy."""
-    prepare_jax()
-    from ppo_dap.training.evaluation import evaluate_policy
-    from ppo_dap.training.run import load_run
-    from ppo_dap.training.video import record_video, require_video
-
-    run = load_run(options.folder)
-    if options.video is not None:
-        require_video(options.video)
-    task = options.task or run.config["task"]
-    row = evaluate_policy(run.policy, task, options.episodes, options.seed).row(run.evaluations[-1]["env_steps"])
-    if options.json:
-        print(json.dumps(row))
-    else:
-        print(
-            f"{task}: return {row['return_mean']:,.1f} +- {row['return_std']:,.1f} over {row['episodes']} episodes, "
-            f"length {row['length_mean']:,.0f}"
-        )
-    if options.video is not None:
-        frames = record_video(run.policy, task, options.video, options.seed)
-        print(f"{options.video}: {frames} frames", file=sys.stderr)
-    return 0
-
-
-def bench(options: argparse.Namespace) -> int:
-    """The benchmark."""
-    from ppo_dap.study.bench import bench, print_bench
-    from ppo_dap.study.sweep import sweep
-    from ppo_dap.tasks import describe
-
-    tasks = options.task or ["Walker2d-v5", "HalfCheetah-v5"]
-    for task in tasks:
-        describe(task)
-    if options.sweep is not None:
-        sweep(tasks[0], Path(options.sweep), functools.partial(print, flush=True))
-        return 0
-    peers = None if options.peers is None else Path(options.peers)
-    if peers is not None and not peers.is_file():
-        raise InputError(f"peers {peers} is no interpreter: `make bench-peers` makes one")
-    figures = bench(tasks, options.steps, options.repeats, peers, functools.partial(print, flush=True))
-    print_bench(figures)
-    if options.json is not None:
-        Path(options.json).write_text(json.dumps(figures, indent=1) + "\n")
-    return 0
-
-
-def audit(options: argparse.Namespace) -> int:
-    """The verdict on a run; exit code 1 on a violation that the method does not declare."""
-    from ppo_dap.training.run import load_run
-
-    run = load_run(options.folder)
-    claims, (strictly, declared) = run.audit(), run.verdict()
-    if options.json:
-        print(json.dumps([dataclasses.asdict(claim) for claim in claims]))
-    else:
-        print("\n".join(map(str, claims)))
-        text = "strictly on-policy (Definition 1)" if strictly else "NOT strictly on-policy"
-        print(f"verdict: {text}" + (f", as method {run.config['method']} is declared" if declared > strictly else ""))
-    return 0 if declared else 1
-
-
-def reliability(options: argparse.Namespace) -> int:
-    """How far a run's Q can be trusted (5.7)."""
-    prepare_jax()
-    from ppo_dap.study import reliability_report as study
-    from ppo_dap.study.diagnostic_figures import require_png
-
-    png = None if options.png is None else require_png(options.png)
-    names = ("states", "rollouts", "horizon", "checkpoint", "seed")
-    given = {name: getattr(options, name) for name in names}
-    found = study.reliability(options.folder, options.prior, **given, progress=study.show_progress(options.states))
-    if options.json:
-        print(json.dumps(without_nan(found.report)))
-    else:
-        study.print_reliability(found.report)
-    if png is not None:
-        study.reliability_figure(found, png)
-    return 0
-
-
-def bound(options: argparse.Namespace) -> int:
-    """The terms of Eq. 14 by iteration."""
-    prepare_jax()
-    from ppo_dap.study import bound as study
-    from ppo_dap.study.diagnostic_figures import require_png
-
-    png = None if options.png is None else require_png(options.png)
-    found = study.bound(options.folder)
-    if options.json:
-        print(json.dumps(without_nan(found.report)))
-    else:
-        study.print_bound(found.report)
-    if png is not None:
-        study.bound_figure(found, png)
-    return 0
-
-
 def without_nan(value: Any) -> Any:
     """`value` with None for every number that is none: JSON has no NaN."""
     if isinstance(value, Mapping):
@@ -281,19 +182,6 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list):
         return [without_nan(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def summary(options: argparse.Namespace) -> int:
-    """Runs side by side."""
-    from ppo_dap.study.summary import print_summary, summarise
-    from ppo_dap.training.run import load_run
-
-    rows = summarise([load_run(folder) for folder in options.folders], options.epochs)
-    if options.json:
-        print(json.dumps(rows))
-    else:
-        print_summary(rows, options.epochs)
-    return 0 if all(row["declared"] for row in rows) else 1
 
 
 def collect(options: argparse.Namespace) -> int:
@@ -346,23 +234,4 @@ def _collect_tiers(options: argparse.Namespace) -> int:
             print(text.format(**row), flush=True)
     if options.json:
         print(json.dumps(rows))
-    return 0
-
-
-def methods(options: argparse.Namespace) -> int:
-    """The capability matrix."""
-    from ppo_dap.methods import ALIASES, TABLES, capability_rows
-
-    rows = capability_rows()
-    if options.json:
-        print(json.dumps(rows))
-        return 0
-    for title, columns in TABLES.items():
-        widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in columns}
-        print(title)
-        for row in ({name: name for name in widths}, *rows):
-            print("  " + "  ".join(row[name].ljust(width) for name, width in widths.items()).rstrip())
-        print()
-    print("also known as: " + ", ".join(f"{alias} = {name}" for alias, name in ALIASES.items()))
-    print("reconstruction: the paper names the method, and no description of it can be read; see docs/methods.md")
     return 0
