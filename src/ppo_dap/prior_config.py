@@ -109,7 +109,7 @@ class FlowConfig(FitConfig):
     kind = "flow"
     learning_rate: float = 2e-3
     """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
-    max_steps: int = 2_500
+    max_steps: int = 2_000
     """Most steps of the fit."""
     couplings: int = 4
     """Affine couplings between the noise and the action."""
