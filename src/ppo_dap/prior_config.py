@@ -126,6 +126,8 @@ class BehaviourConfig(FitConfig):
     rules: ClassVar[dict[str, Rule]] = {"log_std_floor": (lambda v: v < 0, "a number below 0")}
     learning_rate: float = 2e-3
     """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
+    max_steps: int = 3_000
+    """Most steps of the fit."""
     width: int = 128
     """Units of the two hidden layers."""
     log_std_floor: float = -2.0
@@ -139,6 +141,8 @@ class FlowConfig(FitConfig):
     kind = "flow"
     learning_rate: float = 2e-3
     """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
+    max_steps: int = 2_000
+    """Most steps of the fit."""
     couplings: int = 4
     """Affine couplings between the noise and the action."""
     width: int = 64
@@ -156,6 +160,8 @@ class VAEConfig(FitConfig):
     kind = "vae"
     learning_rate: float = 1e-3
     """Adam's rate after warm-up; falls to 0 along a cosine over `max_steps`."""
+    max_steps: int = 2_000
+    """Most steps of the fit."""
     width: int = 256
     """Units of the two hidden layers of the encoder and of the decoder."""
     latents_per_action: int = 2

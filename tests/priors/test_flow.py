@@ -18,7 +18,7 @@ def rough(action_size, couplings=4, seed=0):
     rng = np.random.default_rng(seed)
     config = FlowConfig(width=16, state_width=16, couplings=couplings)
     flow = Flow.create(rng, config, jnp.zeros(2), jnp.ones(2), jnp.asarray(0.5), action_size)
-    moved = jax.tree.map(lambda w: w + jnp.asarray(0.15 * rng.standard_normal(w.shape), w.dtype), flow)
+    moved = jax.tree.map(lambda w: jnp.asarray(np.asarray(w) + 0.15 * rng.standard_normal(w.shape), w.dtype), flow)
     return dataclasses.replace(moved, observation_std=jnp.ones(2), spread=flow.spread)
 
 
@@ -40,7 +40,7 @@ def density(flow, state, points):
     return np.exp(np.asarray(log_prob(flow, *at(state, len(points)), jnp.asarray(points, jnp.float32)), np.float64))
 
 
-@pytest.mark.parametrize("action_size", [1, 2, 5])
+@pytest.mark.parametrize("action_size", [1, 3])
 def test_inverse_undoes_forward(action_size):
     flow = rough(action_size)
     noise = jnp.clip(jax.random.normal(jax.random.key(0), (3, 50, action_size)), -2.0, 2.0)
@@ -52,9 +52,8 @@ def test_inverse_undoes_forward(action_size):
     np.testing.assert_allclose(forward(flow, *states, back), actions, atol=1e-5)
 
 
-@pytest.mark.parametrize("action_size", [1, 3])
-def test_log_determinant_is_that_of_the_whole_jacobian(action_size):
-    flow = rough(action_size)
+def test_log_determinant_is_that_of_the_whole_jacobian():
+    flow, action_size = rough(3), 3
     noise = 0.7 * jax.random.normal(jax.random.key(1), (20, action_size))
 
     def one(z):
@@ -77,7 +76,7 @@ def test_couplings_take_turns(action_size):
 
 def test_density_integrates_to_1_over_the_box(fitted):
     """On a grid in atanh(a), since a density may be steep at the box's edges: da = (1 - a^2) d atanh(a)."""
-    edges = np.linspace(-6.5, 6.5, 361)
+    edges = np.linspace(-6.5, 6.5, 221)
     points = np.tanh(np.stack(np.meshgrid(edges, edges, indexing="ij"), axis=-1).reshape(-1, 2))
     area = np.prod(1 - points**2, axis=1) * (edges[1] - edges[0]) ** 2
     for flow, states in ((fitted("flow").network, [*STATES[:2], np.array([7.0, -7.0])]), (rough(2), STATES[:1])):

@@ -84,8 +84,9 @@ def test_condition_conditions(labelled):
         condition = jnp.asarray(np.tile([label, 1.0], (50, 1)), jnp.float32)
         actions, _ = labelled.sample(jnp.zeros((50, 2)), condition, noise, solver)
         assert float(jnp.mean(actions)) == pytest.approx(0.5 * label, abs=0.03)
-        # The autoencoder loses a spread this small, as test_vae says.
-        assert float(jnp.std(actions)) < 0.1 if kind == "vae" else pytest.approx(0.1, abs=0.03) == jnp.std(actions)
+        # The clone has a floor of exp(-2) = 0.135; the autoencoder loses a spread this small, as test_vae says.
+        low, high = {"behaviour": (0.13, 0.16), "vae": (0.0, 0.1)}.get(kind, (0.07, 0.13))
+        assert low < float(jnp.std(actions)) < high
     # Asked for nothing it gives what both labels give together.
     actions, _ = labelled.sample(jnp.zeros((50, 2)), jnp.zeros((50, 2)), noise, solver)
     assert float(jnp.mean(actions > 0)) == pytest.approx(0.5, abs=0.08)

@@ -51,7 +51,7 @@ def test_loss_is_the_error_plus_the_weighted_divergence():
     rng = np.random.default_rng(0)
     vae = VAE.create(rng, VAEConfig(width=8), jnp.zeros(2), jnp.ones(2), jnp.asarray(0.5), 3)
     # Far from its start, where the divergence is near 0.
-    vae = dataclasses.replace(vae, encoder=jax.tree.map(lambda w: 2 * w + 0.3, vae.encoder))
+    vae = dataclasses.replace(vae, encoder=jax.tree.map(lambda w: jnp.asarray(2 * np.asarray(w) + 0.3), vae.encoder))
     actions, draws = (jnp.asarray(rng.uniform(-1, 1, (3, n)), jnp.float32) for n in (3, 6))
     inputs = jnp.asarray(STATES, jnp.float32), jnp.zeros((3, 0)), actions, draws
 
