@@ -86,7 +86,7 @@ def reliability(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in names}
     found = study.reliability(options.folder, options.prior, **given, progress=study.show_progress(options.states))
     if options.json:
-        print(json.dumps(without_nan(found.report)))
+        print(json.dumps(_without_nan(found.report)))
     else:
         study.print_reliability(found.report)
     if png is not None:
@@ -103,7 +103,7 @@ def bound(options: argparse.Namespace) -> int:
     png = None if options.png is None else require_png(options.png)
     found = study.bound(options.folder)
     if options.json:
-        print(json.dumps(without_nan(found.report)))
+        print(json.dumps(_without_nan(found.report)))
     else:
         study.print_bound(found.report)
     if png is not None:
@@ -141,3 +141,12 @@ def methods(options: argparse.Namespace) -> int:
     print("also known as: " + ", ".join(f"{alias} = {name}" for alias, name in ALIASES.items()))
     print("reconstruction: the paper names the method, and no description of it can be read; see docs/methods.md")
     return 0
+
+
+def _without_nan(value: Any) -> Any:
+    """`value` with None for every number that is none: JSON has no NaN."""
+    if isinstance(value, Mapping):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

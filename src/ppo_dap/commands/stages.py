@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import itertools
 import json
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -173,15 +172,6 @@ def _print_profile(metrics: Sequence[Mapping[str, Any]]) -> None:
         if parts:
             total = sum(line.seconds for line in parts) / (len(metrics) - 1) * 1e3
             print(label.format(total=total) + ": " + ", ".join(f"{line.name} {line.share:.0%}" for line in parts))
-
-
-def without_nan(value: Any) -> Any:
-    """`value` with None for every number that is none: JSON has no NaN."""
-    if isinstance(value, Mapping):
-        return {name: without_nan(part) for name, part in value.items()}
-    if isinstance(value, list):
-        return [without_nan(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def collect(options: argparse.Namespace) -> int:
