@@ -6,8 +6,11 @@ import argparse
 import dataclasses
 import functools
 import json
+import math
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ppo_dap.errors import InputError
 from ppo_dap.training.manifest import prepare_jax
