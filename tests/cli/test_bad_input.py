@@ -61,7 +61,7 @@ BAD = {
     "logs without use": (f"{PPO} --logs @good.npz", "logs are used by a warm start alone", "leave logs out"),
     "warm start without logs": (f"train --task {TASK} --method ppo-bc --out out", "warm_start 'actor' needs logs"),
     # Priors.
-    "no prior": (f"train --task {TASK} --out out", "ppo-dap needs a diffusion prior", "ppo-dap pretrain --kind diffusion"),
+    "no prior": (f"train --task {TASK} --out out", "ppo-dap needs a diffusion prior", "pretrain --kind diffusion"),
     "prior for ppo": (f"{PPO} --prior @prior", "method ppo has no prior", "leave it out"),
     "prior: dimensions": (f"{DAP} @prior-wide", "logs of Hopper-v5", "observation_size 11", "observation_size 3"),
     "prior: actions": (f"{DAP} @prior-two", "another task", "action_size 2", "Pendulum-v1 has action_size 1"),

@@ -24,7 +24,9 @@ COMMANDS = (
     "summary",
     "collect",
     "bench",
+    "bound",
     "methods",
+    "reliability",
 )
 
 
