@@ -129,7 +129,11 @@ def _from_logs_to_runs(command: Command) -> None:
     )
     logs_option(sub, False)
     sub.add_argument("--out", required=True, metavar="FOLDER", help="run folder")
-    sub.add_argument("--preset", default="paper", help="paper (Table 2) or tuned (default: %(default)s)")
+    sub.add_argument(
+        "--preset",
+        default="paper",
+        help="paper (Table 2), tuned, or tuned-warm, which needs logs (default: %(default)s)",
+    )
     sub.add_argument("--resume", action="store_true", help="go on from the last checkpoint in --out")
     sub.add_argument("--quiet", action="store_true", help="no progress")
     sub.add_argument("--json", action="store_true", help="print the last evaluation as JSON")
