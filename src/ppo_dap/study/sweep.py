@@ -26,23 +26,23 @@ ROWS, STEPS = 20_000, 2048 * 16
 
 
 def sweep(task: str, table: Path, say: Callable[[str], None]) -> None:
-    """Write `table` (a row a setting) and the figure beside it; one run a setting, all else as in preset `paper`."""
+    """Write `table` (a row a setting) and the figure beside it; one run a setting, all else as in preset `paper`.
+
+    A row is written as soon as it is measured.
+    """
+    settings = [(task, knob, value, (option, str(value))) for knob, (option, every) in KNOBS.items() for value in every]
+    settings += [(other, "action dimensions", size, ()) for other, size in ACTION_SIZES.items()]
     rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory(prefix="ppo-dap-sweep-") as name:
-        folder = Path(name)
-        priors = {each: _prior(folder, each) for each in {task, *ACTION_SIZES}}
-        for knob, (option, values) in KNOBS.items():
-            for value in values:
-                rows.append(_row(folder, task, priors[task], knob, value, (option, str(value))))
-                say(_line(rows[-1]))
-        for other, size in ACTION_SIZES.items():
-            rows.append(_row(folder, other, priors[other], "action dimensions", size, ()))
-            say(_line(rows[-1]))
     table.parent.mkdir(parents=True, exist_ok=True)
-    with open(table, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
+    with tempfile.TemporaryDirectory(prefix="ppo-dap-sweep-") as name, open(table, "w", newline="") as file:
+        writer = csv.DictWriter(file, ["task", "knob", "value", *DEVICE, "iteration"])
         writer.writeheader()
-        writer.writerows(rows)
+        priors = {each: _prior(Path(name), each) for each in {task, *ACTION_SIZES}}
+        for on, knob, value, options in settings:
+            rows.append(_row(Path(name), on, priors[on], knob, value, options))
+            writer.writerow(rows[-1])
+            file.flush()
+            say(_line(rows[-1]))
     draw(rows, table.with_suffix(".png"))
     say(f"{table} and {table.with_suffix('.png')}")
 
