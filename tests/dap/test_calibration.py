@@ -132,5 +132,5 @@ def test_calibration_mends_a_miscalibrated_q_on_rows_it_has_not_seen():
 def test_rows_of_different_numbers_are_refused(rows):
     q, y = (np.linspace(0, 1, n, dtype=np.float32) for n in rows)
     unchecked = inspect.unwrap(calibrate)  # the tests' type checker would speak first
-    with pytest.raises(ValueError, match="3.*5|5.*3"):
+    with pytest.raises(ValueError, match=r"3.*5|5.*3"):
         unchecked(q, y, "affine")
