@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from ppo_dap.logs import Logs
-from ppo_dap.prior_config import FITTED, DiffusionConfig
+from ppo_dap.prior_config import DiffusionConfig
 from ppo_dap.priors.diffusion import Denoiser, sample_actions
 from ppo_dap.priors.fit import fit_prior
 from ppo_dap.priors.samplers import Solver
@@ -43,7 +43,7 @@ def sampled(denoiser, weight, label=1.0, known=1.0, solver="ancestral", steps=20
 @pytest.mark.parametrize("weight", [0.0, 0.5, 1.0, 2.0, 3.0])
 def test_guidance_goes_as_far_beyond_the_unconditioned_prior_as_it_says(solver, weight):
     """u + w (c - u), of denoisers of N(0, SD^2) and N(SHIFT, SD^2), is the one of N(w SHIFT, SD^2)."""
-    actions = sampled(KNOWN, weight, solver=solver)
+    actions = sampled(KNOWN, weight, solver=solver, steps=200)  # so many that Eq. 8 keeps the spread
     assert actions.mean() == pytest.approx(weight * SHIFT, abs=0.015)
     assert stats.kstest(actions - actions.mean(), stats.norm(0, actions.std()).cdf).pvalue > 1e-3
     assert actions.std() == pytest.approx(SD, rel=0.1)
@@ -53,7 +53,7 @@ def fresh():
     """A network without any pattern, which reads the condition."""
     made = Denoiser.create(np.random.default_rng(0), CONFIG, jnp.zeros(2), jnp.ones(2), jnp.asarray(0.5), 1)
     rng = np.random.default_rng(2)
-    return jax.tree.map(lambda x: x + jnp.asarray(0.3 * rng.standard_normal(x.shape), jnp.float32), made)
+    return jax.tree.map(lambda x: x + jnp.asarray(0.1 * rng.standard_normal(x.shape), jnp.float32), made)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -86,12 +86,11 @@ def test_a_prior_without_a_condition_has_nothing_to_be_guided_towards():
 # --- fitted to logs in which the best episodes act differently ------------------------------------------------------
 
 
+# One that is trained, one that denoises and one that is built; `labelled` has the networks of all kinds.
 QUICK = {"max_steps": 400, "chunk_steps": 200, "batch_size": 128, "warmup_steps": 50, "ema_decay": 0.98}
 OPTIONS = {
     "diffusion": {**QUICK, "width": 32, "state_width": 32},
     "behaviour": {**QUICK, "width": 32},
-    "flow": {**QUICK, "width": 32, "state_width": 32, "couplings": 2, "learning_rate": 5e-3},
-    "vae": {**QUICK, "width": 32, "learning_rate": 3e-3},
     "retrieval": {"return_weight": 10.0},
 }
 
@@ -112,7 +111,7 @@ def logs_of_good_and_bad():
 LOGS = logs_of_good_and_bad()
 
 
-@pytest.mark.parametrize("kind", FITTED)
+@pytest.mark.parametrize("kind", OPTIONS)
 def test_asked_for_the_top_it_acts_as_the_good_episodes_did_and_else_as_all(kind):
     prior = fit_prior(LOGS, kind, seed=0, condition_on="return", **OPTIONS[kind])
     train, _ = LOGS.split(prior.config.validation_fraction, 0)
