@@ -84,7 +84,7 @@ def test_guidance_is_both_by_default_and_no_warm_start():
 
 
 def test_presets_differ_from_the_paper_only_where_they_say():
-    assert set(PRESETS) == {"paper", "tuned"}
+    assert set(PRESETS) == {"paper", "tuned", "tuned-warm"}
     assert make("paper") == make() == Config()
     default = flatten(Config())
     for name, stated in PRESETS.items():
@@ -98,7 +98,7 @@ def test_options_go_on_top_of_the_preset():
 
 
 def test_unknown_preset_lists_them():
-    with pytest.raises(InputError, match=r"unknown preset 'best': .*paper, tuned"):
+    with pytest.raises(InputError, match=r"unknown preset 'best': .*paper, tuned, tuned-warm"):
         make("best")
 
 

@@ -201,7 +201,7 @@ def test_compatible_options_are_kept(method, options):
     assert {name: resolved[name] for name in options} == options
 
 
-@pytest.mark.parametrize("preset", ["paper", "tuned"])
+@pytest.mark.parametrize("preset", ["paper", "tuned", "tuned-warm"])
 @pytest.mark.parametrize("name", METHODS)
 def test_a_method_changes_what_it_fixes_and_nothing_else(name, preset):
     method, config = get_method(name), make(preset)

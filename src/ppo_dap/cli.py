@@ -129,7 +129,11 @@ def _from_logs_to_runs(command: Command) -> None:
     )
     logs_option(sub, False)
     sub.add_argument("--out", required=True, metavar="FOLDER", help="run folder")
-    sub.add_argument("--preset", default="paper", help="paper (Table 2) or tuned (default: %(default)s)")
+    sub.add_argument(
+        "--preset",
+        default="paper",
+        help="paper (Table 2), tuned, or tuned-warm, which needs logs (default: %(default)s)",
+    )
     sub.add_argument("--resume", action="store_true", help="go on from the last checkpoint in --out")
     sub.add_argument("--quiet", action="store_true", help="no progress")
     sub.add_argument("--json", action="store_true", help="print the last evaluation as JSON")
@@ -166,6 +170,12 @@ def _about_runs(command: Command) -> None:
     sub.add_argument(
         "--epochs", type=positive_number, default=40.0, help="T of ALC@T, in 5k steps (default: %(default)s)"
     )
+    text = "instead: every method against METHOD on the same seeds, with intervals and exact tests; ppo, 'ppo (tuned)'"
+    sub.add_argument(
+        "--compare", metavar="METHOD", help=text + " and 'ppo-dap + lambda_kl=0.1' are methods of their own"
+    )
+    sub.add_argument("--markdown", action="store_true", help="print the comparison as Markdown")
+    sub.add_argument("--csv", metavar="FILE", help="write the rows to a .csv as well")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
     _diagnostics(command)

@@ -1,8 +1,9 @@
 """Every setting of a run, as frozen dataclasses: the paper's Table 2, the PPO recipe, and what both leave open.
 
 Field names are unique over all groups, so one flat name (`lambda_kl`, on the command line `--lambda-kl`) finds its
-field; `replace` does that. `PRESETS` holds the two settings that every result is quoted with: `paper` is Table 2 to the
-letter, `tuned` is the best that our own studies found (docs/results.md says on which seeds).
+field; `replace` does that. `PRESETS` holds the settings that results are quoted with: `paper` is Table 2 to the letter,
+`tuned` the best that our own studies found with a prior alone, `tuned-warm` with logs that also start the networks
+(docs/results.md says on which seeds).
 """
 
 from __future__ import annotations
@@ -231,7 +232,11 @@ class Config:
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "tuned": {"lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "kl_rule": "monitor"},
-}
+    "tuned-warm": {
+        "lambda_kl": 0.2, "lambda_aux": 0.0, "lambda_decay": 0.5, "kl_rule": "monitor",
+        "warm_start": "actor_critic", "logs_filter": 0.3,
+    },
+}  # fmt: skip
 
 
 def field_groups() -> dict[str, str]:

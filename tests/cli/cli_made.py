@@ -80,9 +80,9 @@ def write_priors(folder):
     (folder / "prior-empty").write_bytes(b"")
     (folder / "prior-text").write_text("not a prior\n")
     save_file({"a": np.zeros(2)}, folder / "prior-foreign")
-    header = {"kind": "prior", "format": 2, "prior": "diffusion"}
+    header = {"kind": "prior", "format": 3, "prior": "diffusion"}
     save_file({"a": np.zeros(2)}, folder / "prior-newer", {"meta": json.dumps(header)})
-    header = {"kind": "prior", "format": 1, "prior": "flow"}
+    header = {"kind": "prior", "format": 2, "prior": "flaw"}
     save_file({"a": np.zeros(2)}, folder / "prior-kind", {"meta": json.dumps(header)})
 
 

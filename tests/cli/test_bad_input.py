@@ -61,7 +61,7 @@ BAD = {
     "logs without use": (f"{PPO} --logs @good.npz", "logs are used by a warm start alone", "leave logs out"),
     "warm start without logs": (f"train --task {TASK} --method ppo-bc --out out", "warm_start 'actor' needs logs"),
     # Priors.
-    "no prior": (f"train --task {TASK} --out out", "ppo-dap needs a prior", "ppo-dap pretrain"),
+    "no prior": (f"train --task {TASK} --out out", "ppo-dap needs a diffusion prior", "pretrain --kind diffusion"),
     "prior for ppo": (f"{PPO} --prior @prior", "method ppo has no prior", "leave it out"),
     "prior: dimensions": (f"{DAP} @prior-wide", "logs of Hopper-v5", "observation_size 11", "observation_size 3"),
     "prior: actions": (f"{DAP} @prior-two", "another task", "action_size 2", "Pendulum-v1 has action_size 1"),
@@ -71,8 +71,8 @@ BAD = {
     "prior: empty": (f"{DAP} @prior-empty", "prior-empty is not a whole prior file"),
     "prior: text": (f"{DAP} @prior-text", "prior-text is not a whole prior file"),
     "prior: foreign": (f"{DAP} @prior-foreign", "not a prior", "`ppo-dap pretrain` writes one"),
-    "prior: newer": (f"{DAP} @prior-newer", "prior format 2", "reads up to 1", "update ppo-dap"),
-    "prior: kind": (f"{DAP} @prior-kind", "unknown prior kind 'flow'", "diffusion"),
+    "prior: newer": (f"{DAP} @prior-newer", "prior format 3", "reads up to 2", "update ppo-dap"),
+    "prior: kind": (f"{DAP} @prior-kind", "unknown prior kind 'flaw'", "diffusion"),
     "prior: missing": (f"{DAP} @nothing", "no prior file at", "ppo-dap pretrain"),
     "prior: folder": (f"{DAP} @other", "no prior file at", "ppo-dap pretrain"),
     # Names.
@@ -156,7 +156,7 @@ def test_bad_input(capsys, files, here, monkeypatch, case):
     def too_far(*arguments, **options):
         raise AssertionError("it was not refused before the learning")
 
-    monkeypatch.setattr(ppo_dap.priors.fit, "train_denoiser", too_far)
+    monkeypatch.setattr(ppo_dap.priors.fit, "train_network", too_far)
     monkeypatch.setattr(ppo_dap.training.run, "_make_trainer", too_far)
     is_refused(capsys, files, here, *BAD[case])
 
@@ -178,6 +178,6 @@ def test_pretrain_into_a_folder(capsys, files, here, monkeypatch):
     import ppo_dap.priors
 
     prior = ppo_dap.priors.load_prior(files / "prior")
-    monkeypatch.setattr(ppo_dap.priors, "fit_prior", lambda logs, **options: prior)
+    monkeypatch.setattr(ppo_dap.priors, "fit_prior", lambda logs, kind, **options: prior)
     command = f"pretrain --logs @good.npz --task {TASK} --out @other"
     is_refused(capsys, files, here, command, "cannot write prior", "other")

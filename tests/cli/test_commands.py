@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from cli.cli_made import TASK, arrays, shell
-from ppo_dap.cli import field_docstrings, main
+from ppo_dap.cli import main
+from ppo_dap.commands.options import field_docstrings
 from ppo_dap.config import Config, field_groups
 from ppo_dap.methods import METHODS
 
@@ -23,7 +24,9 @@ COMMANDS = (
     "summary",
     "collect",
     "bench",
+    "bound",
     "methods",
+    "reliability",
 )
 
 

@@ -115,16 +115,33 @@ def bound(options: argparse.Namespace) -> int:
 
 
 def summary(options: argparse.Namespace) -> int:
-    """Runs side by side."""
+    """Runs side by side, or methods against a baseline."""
+    from ppo_dap.study.compare import comparable, compare, markdown, overall, print_comparison, save_csv
     from ppo_dap.study.summary import print_summary, summarise
     from ppo_dap.training.run import load_run
 
+    if options.markdown and options.compare is None:
+        raise InputError("--markdown prints a comparison: give --compare METHOD as well")
     rows = summarise([load_run(folder) for folder in options.folders], options.epochs)
-    if options.json:
+    fair = all(row["declared"] for row in rows)
+    if options.compare is None:
+        shown, over_tasks = rows, []
+    else:
+        finished = comparable(rows, options.compare)
+        shown, over_tasks = compare(finished, options.compare), overall(finished, options.compare)
+    if options.json and options.compare is not None:
+        print(json.dumps(_without_nan({"tasks": shown, "overall": over_tasks})))
+    elif options.json:
         print(json.dumps(rows))
+    elif options.markdown:
+        print(markdown(shown, over_tasks, options.epochs))
+    elif options.compare is not None:
+        print_comparison(shown, over_tasks, options.epochs)
     else:
         print_summary(rows, options.epochs)
-    return 0 if all(row["declared"] for row in rows) else 1
+    if options.csv is not None:
+        save_csv(shown, options.csv)
+    return 0 if fair else 1
 
 
 def methods(options: argparse.Namespace) -> int:

@@ -44,13 +44,17 @@ class Probe(eqx.Module):
 
 
 def policy_metrics(actor: Actor, old_log_std: Float[Array, " act"], rows: Rows) -> dict[str, Float[Array, ""]]:
-    """policy-KL, E[KL(pi_{k+1} || pi_k)] on D_on (A.1), and the surrogate E[ratio * A] of Eq. 14."""
+    """policy-KL, E[KL(pi_{k+1} || pi_k)] on D_on (A.1), and the surrogate E[ratio * A] of Eq. 14.
+
+    Without the mean of A, which is 0 for the true advantages and is V's error for GAE's.
+    """
     means = actor(rows.observations)
     kl = gaussian_kl(means, actor.log_std[None], rows.old_means, old_log_std[None])
     ratio = jnp.exp(log_prob(rows.actions, means, actor.log_std) - rows.old_log_probs)
+    advantages = rows.advantages - weighted_mean(rows.advantages, rows.weights)
     return {
         "policy_kl": weighted_mean(kl, rows.weights),
-        "surrogate": weighted_mean(ratio * rows.advantages, rows.weights),
+        "surrogate": weighted_mean(ratio * advantages, rows.weights),
     }
 
 
