@@ -1,8 +1,12 @@
 """Eq. 7's weights and Eq. 8's drift, against numbers by hand and finite differences."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import softmax
+from scipy.stats import norm
 
 from dap.dap_made import filled, quick_jit, slope_q
 from ppo_dap.config import ProposalConfig
@@ -12,6 +16,7 @@ from ppo_dap.dap.guidance import (
     clip_norm,
     effective_sample_size,
     energy_weights,
+    farthest,
     guidance_step,
     top_k_mask,
     within_state_spread,
@@ -124,3 +129,75 @@ def test_cap_leaves_short_vectors_alone():
     np.testing.assert_allclose(clip_norm(vectors, 0.1), [[[0.06, 0.08], [0.03, 0.04], [0, 0]]], rtol=1e-6)
     short = guidance_step(f32([[0.1, 0.0]]), jnp.float32(0.3), 0.1, "step")
     np.testing.assert_allclose(short, [[[0.03, 0.0]]], rtol=1e-6)
+
+
+_farthest = quick_jit(farthest, static_argnums=1)
+_weights = quick_jit(energy_weights)
+
+
+def greedy(points, num):
+    """Indices of `num` of the points (k, act), by the definition of Gonzalez's rule."""
+    chosen = [0]
+    while len(chosen) < num:
+        nearest = [min(np.linalg.norm(p - points[c]) for c in chosen) for p in points]
+        chosen.append(int(np.argmax(nearest)))
+    return chosen
+
+
+def radius(points, chosen):
+    """How far the farthest point is from the nearest chosen one."""
+    return max(min(np.linalg.norm(p - points[c]) for c in chosen) for p in points)
+
+
+@pytest.mark.parametrize("num", [1, 2, 4, 8])
+def test_farthest_is_the_greedy_choice_and_covers_as_it_must(num):
+    points = np.random.default_rng(0).uniform(-1, 1, (30, 8, 3))
+    chosen = np.asarray(_farthest(jnp.asarray(points, jnp.float32), num))
+    assert chosen.shape == (30, num)
+    assert (chosen[:, 0] == 0).all()
+    for row, indices in zip(points, chosen.tolist(), strict=True):
+        assert indices == greedy(row, num)
+        assert len({*indices}) == num
+        best = min(radius(row, subset) for subset in itertools.combinations(range(8), num))
+        assert radius(row, indices) <= 2 * best + 1e-6  # Gonzalez's theorem
+
+
+def test_farthest_takes_both_of_two_clusters_and_copies_last():
+    rng = np.random.default_rng(1)
+    label = np.array([rng.permutation([0, 0, 0, 0, 0, 0, 0, 1, 1, 1]) for _ in range(50)])
+    points = np.array([[0.5, 0.4], [-0.5, -0.3]])[label] + 0.05 * rng.standard_normal((50, 10, 2))
+    two = np.asarray(_farthest(jnp.asarray(points, jnp.float32), 2))
+    assert (np.take_along_axis(label, two, axis=1).sum(axis=1) == 1).all()
+    # Two different points and copies of them: the two are taken before any copy.
+    copies = jnp.asarray(np.repeat(points[:1, :1], 4, axis=1), jnp.float32).at[0, 2].add(0.1)
+    assert np.asarray(_farthest(copies, 2)).tolist() == [[0, 2]]
+
+
+def test_energy_weights_with_a_log_density_are_its_softmax():
+    rng = np.random.default_rng(3)
+    q, log_density = rng.standard_normal((20, 6)), 3 * rng.standard_normal((20, 6))
+    kept = rng.random((20, 6)) < 0.7
+    kept[:, 2] = True
+    args = jnp.asarray(q, jnp.float32), jnp.float32(1.5), jnp.float32(0.4), jnp.asarray(kept)
+    weights = np.asarray(_weights(*args, jnp.asarray(log_density, jnp.float32)))
+    expected = softmax(np.where(kept, 1.5 * q / 0.4 + log_density, -np.inf), axis=1)
+    np.testing.assert_allclose(weights, expected, atol=1e-5)
+    assert np.abs(weights - softmax(np.where(kept, 1.5 * q / 0.4, -np.inf), axis=1)).max() > 0.1
+
+
+@pytest.mark.parametrize("kappa", [0.5, 1.0, 2.0])
+def test_without_q_the_weights_are_a_power_of_the_policy(kappa):
+    mean, std = np.array([0.2, -0.1]), np.array([0.3, 0.6])
+    actions = np.random.default_rng(4).uniform(-1, 1, (20, 6, 2))
+    density = norm.pdf(actions, mean, std).prod(-1)
+    q, exponent = 50 * NOISE[0, :1, :].repeat(20, 0), jnp.asarray(kappa * np.log(density), jnp.float32)
+    weights = _weights(q, jnp.float32(0), jnp.float32(1), jnp.ones((20, 6), bool), exponent)
+    expected = density**kappa / (density**kappa).sum(1, keepdims=True)
+    np.testing.assert_allclose(weights, expected, atol=1e-5)
+
+
+def test_a_policy_far_away_from_all_proposals_leaves_weights_that_sum_to_1():
+    far = f32([-3e4, -3e4 + 1, -3e38], [-1e30, -1e30, -1e30])
+    ones = jnp.ones((2, 3), bool)
+    weights = np.asarray(_weights(jnp.zeros((2, 3)), jnp.float32(1), jnp.float32(1), ones, far))
+    np.testing.assert_allclose(weights, [[1 / (1 + np.e), np.e / (1 + np.e), 0], [1 / 3] * 3], atol=1e-3)

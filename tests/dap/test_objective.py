@@ -16,8 +16,10 @@ from ppo_dap.dap.objective import (
     GatedProposals,
     Weights,
     added_gradient,
+    added_terms,
     admit,
     admit_proposals,
+    advantage_weighted_loss,
     proposal_terms,
     provenance,
 )
@@ -163,3 +165,90 @@ def test_a_stale_batch_is_refused_as_a_whole():
     states = jnp.asarray(STATES[[0, 1, 3]])
     assert np.asarray(provenance(ids, states, BATCH)).all()
     assert not np.asarray(provenance(ids, states, BATCH._replace(first_id=jnp.asarray(204, jnp.int32)))).any()
+
+
+# --- advantage-weighted imitation -----------------------------------------------------------------------------------
+
+
+def awr_rows(weights=(1, 1, 0, 1, 1), dtype=jnp.float32, **columns):
+    """Rows whose actions, advantages and observations have no pattern."""
+    made = {
+        "observations": numbers(N, 3, seed=11),
+        "actions": numbers(N, 2, seed=12),
+        "advantages": numbers(N, seed=13),
+    }
+    made = {name: jnp.asarray(columns.get(name, value), dtype) for name, value in made.items()}
+    return changed(ROWS, **made, weights=jnp.asarray(weights, dtype))
+
+
+def awr_by_hand(actor, rows, temperature, cap):
+    """Row by row, over those with weight; also the rows' importance."""
+    kept = [i for i in range(N) if rows.weights[i] > 0]
+    advantages = np.asarray(rows.advantages, np.float64)[kept]
+    means, std = np.asarray(actor(rows.observations))[kept], np.exp(np.asarray(actor.log_std))
+    importance = [min(np.exp((a - advantages.mean()) / advantages.std() / temperature), cap) for a in advantages]
+    logs = norm.logpdf(np.asarray(rows.actions)[kept], means, std).sum(-1)
+    return -np.mean(np.array(importance) * logs), np.array(importance)
+
+
+awr = jax.jit(advantage_weighted_loss, static_argnums=(2, 3))
+
+
+@pytest.mark.parametrize(("temperature", "cap", "capped"), [(1.0, 20.0, 0), (0.5, 2.0, 1), (0.1, 1e-3, 3)])
+def test_advantage_weighted_imitation_by_hand(actor, temperature, cap, capped):
+    rows = awr_rows()
+    expected, importance = awr_by_hand(actor, rows, temperature, cap)
+    assert (importance == cap).sum() >= capped
+    assert (importance == cap).any() == (capped > 0)
+    assert float(awr(actor, rows, temperature, cap)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_its_gradient_is_the_finite_difference_in_every_parameter(actor):
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), actor)
+        flat, restore = ravel_pytree(wide)
+        value = jax.jit(lambda p: advantage_weighted_loss(restore(p), awr_rows(dtype=jnp.float64), 0.7, 3.0))
+        gradient, steps = jax.jit(jax.grad(value))(flat), 1e-5 * jnp.eye(len(flat))
+        slopes = [float(value(flat + step) - value(flat - step)) / 2e-5 for step in steps]
+    np.testing.assert_allclose(gradient, slopes, atol=1e-8)
+    assert (np.asarray(gradient) != 0).all()
+
+
+def test_rows_without_weight_have_no_influence_whatever_their_action_is(actor):
+    gradient = jax.jit(jax.value_and_grad(advantage_weighted_loss), static_argnums=(2, 3))
+    clean = gradient(actor, awr_rows(), 1.0, 20.0)
+    for poison in (50.0, np.nan, np.inf):
+        actions = np.array(awr_rows().actions)
+        actions[2] = poison
+        assert bits(gradient(actor, awr_rows(actions=actions), 1.0, 20.0)) == bits(clean)
+    advantages = np.array(awr_rows().advantages)
+    advantages[2] = 1e3
+    np.testing.assert_allclose(awr(actor, awr_rows(advantages=advantages), 1.0, 20.0), clean[0], rtol=1e-6)
+    # With weight it counts.
+    actions[2] = 50.0
+    assert bits(gradient(actor, awr_rows(actions=actions, weights=(1, 1, 1, 1, 1)), 1.0, 20.0)) != bits(clean)
+    none = gradient(actor, awr_rows(weights=(0, 0, 0, 0, 0)), 1.0, 20.0)
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(none))
+
+
+def test_no_gradient_passes_through_the_advantages(actor):
+    def loss(advantages):
+        return advantage_weighted_loss(actor, changed(awr_rows(), advantages=advantages), 1.0, 20.0)
+
+    advantages = awr_rows().advantages
+    assert not np.any(jax.grad(loss)(advantages))
+    assert abs(float(loss(advantages[::-1]) - loss(advantages))) > 1e-3  # they do matter
+
+
+def test_without_proposals_it_is_all_that_is_added(actor):
+    config = ObjectiveConfig(lambda_awr=0.3, awr_temperature=0.7, awr_weight_cap=3.0)
+    weights, rows = Weights(*(jnp.float32(x) for x in (5.0, 7.0, 0.2))), awr_rows()
+    expected, _ = awr_by_hand(actor, rows, 0.7, 3.0)
+    loss, metrics = added_terms(actor, rows, (), weights, config=config)
+    assert {name: float(value) for name, value in metrics.items()} == {"awr_loss": pytest.approx(expected, rel=1e-4)}
+    # lambda_awr in the config says whether, the weight of this iteration how much.
+    assert float(loss) == pytest.approx(0.2 * expected, rel=1e-4)
+    both, metrics = added_terms(actor, rows, gated_of(), weights, config=config)
+    alone, _ = added_terms(actor, rows, gated_of(), weights, config=ObjectiveConfig())
+    assert float(both - alone) == pytest.approx(0.2 * expected, rel=1e-3)
+    assert metrics.keys() == {"kl_loss", "aux_loss", "awr_loss"}

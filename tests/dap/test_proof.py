@@ -19,7 +19,7 @@ from ppo_dap.dap import audit, objective
 from ppo_dap.dap.dataflow import Flow
 from ppo_dap.dap.objective import proposal_terms
 from ppo_dap.training import proof
-from ppo_dap.training.algorithm import Stages
+from ppo_dap.training.algorithm import Stages, adds
 
 RATIO, ADVANTAGES, V, PET, POLICY, REST = [row[1] for row in audit.FORBIDDEN]
 
@@ -115,6 +115,24 @@ def test_plain_ppo_is_proved_too(config):
     claims = proof.prove(learner_of(config, guided=False), None, config, Stages(config, guided=False))
     assert {claim.statement for claim in claims} == {RATIO, ADVANTAGES, V, POLICY, REST}
     assert violated(claims) == set()
+
+
+def test_plain_ppo_with_advantage_weighted_imitation_is_proved_too():
+    config = small_config(lambda_awr=0.1)
+    arguments = learner_of(config, guided=False), None, config, Stages(config, guided=False)
+    claims = proof.prove(*arguments)
+    assert {claim.statement for claim in claims} == {RATIO, ADVANTAGES, V, POLICY, REST}
+    assert violated(claims) == set()
+    assert adds(config, guided=False)
+    assert not adds(small_config(), guided=False)
+
+
+def test_a_leak_is_found_with_advantage_weighted_imitation_too(frozen):
+    config = small_config(lambda_awr=0.1)
+    stages, learner = Stages(config, guided=True), learner_of(config)
+    assert violated(proved(learner, frozen, config, stages)) == set()
+    fault = tamper("actor", offline_rows_in_the_actor_loss)
+    assert violated(proved(learner, frozen, config, stages, fault)) == {RATIO, POLICY, REST}
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,11 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
 from dap.dap_made import bits, changed, filled, quick_jit
 from ppo_dap.config import QConfig
-from ppo_dap.dap.q_learning import ADAM, QData, fit_q, trainable
+from ppo_dap.dap.q_learning import ADAM, QData, fit_q, rank_correlation, trainable
 from ppo_dap.nets.critic import Critic, QFunction, q_features
 from ppo_dap.ppo.update import draw_orders
 
@@ -78,3 +79,45 @@ def test_rows_without_weight_teach_nothing(fit, rows):
     )
     assert bits(clean) == bits(ignored)
     assert bits(clean) != bits(counted)
+
+
+ranked = quick_jit(rank_correlation)
+
+
+def correlation(x, y, weights=None):
+    weights = np.ones(len(x)) if weights is None else weights
+    return float(ranked(*(jnp.asarray(v, jnp.float32) for v in (x, y, weights))))
+
+
+@pytest.mark.parametrize("strength", [-1.0, 0.0, 0.3, 3.0])
+def test_rank_correlation_is_spearmans_over_the_rows_with_weight(strength):
+    rng = np.random.default_rng(0)
+    x, noise = rng.standard_normal((2, 300))
+    y = np.exp(strength * x + noise)  # ranks, and nothing else, are a Gaussian's
+    weights = (rng.random(300) < 0.7).astype(float)
+    expected = spearmanr(x[weights > 0], y[weights > 0]).statistic
+    # What rows without weight hold does not matter.
+    for poison in (0.0, 1e30, -1e30, np.inf, np.nan):
+        masked = [np.where(weights > 0, values, poison) for values in (x, y)]
+        assert correlation(*masked, weights) == pytest.approx(expected, abs=1e-5)
+    assert abs(spearmanr(x, y).statistic - expected) > 1e-3
+
+
+def test_rank_correlation_of_ties_is_spearmans():
+    x, y = np.random.default_rng(1).integers(0, 5, (2, 300))
+    y = x + y
+    assert correlation(x, y) == pytest.approx(spearmanr(x, y).statistic, abs=1e-5)
+
+
+def test_rank_correlation_at_its_ends():
+    x = np.random.default_rng(2).standard_normal(300)
+    assert correlation(x, x) == pytest.approx(1, abs=1e-6)
+    assert correlation(x, np.exp(x)) == pytest.approx(1, abs=1e-6)
+    assert correlation(x, -x) == pytest.approx(-1, abs=1e-6)
+    rising = np.sort(x)
+    # Nothing to rank by, or nothing to rank.
+    assert correlation(np.full(300, 3.0), rising) == pytest.approx(0, abs=1e-6)
+    assert correlation(rising, np.full(300, 3.0)) == pytest.approx(0, abs=1e-6)
+    assert correlation(np.zeros(300), np.zeros(300)) == 0
+    assert correlation(rising, rising, np.zeros(300)) == 0
+    assert correlation(rising, rising, np.arange(300) == 7) == 0

@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ppo_dap.dap.q_learning import QData, q_loss
 from ppo_dap.nets.critic import Critic, QFunction, q_features
 
 OBSERVATIONS = jnp.asarray(np.random.default_rng(0).standard_normal((6, 3)), jnp.float32)
@@ -73,3 +74,54 @@ def test_values_and_q_equal_plain_numpy_row_by_row():
             action = numpy_linear(head.action, np.asarray(ACTIONS)[i, k])
             both = np.tanh(numpy_linear(head.state, hidden) + action)
             assert float(q_values[i, k]) == pytest.approx(numpy_linear(head.out, both)[0], abs=1e-5)
+
+
+# --- several heads --------------------------------------------------------------------------------------------------
+
+
+FEATURES = CRITIC.features(OBSERVATIONS)
+TWO = QFunction.create(np.random.default_rng(1), 3, 2, 8, 5, False, 2)
+values_of = jax.jit(lambda q, pessimism: q(FEATURES, ACTIONS, pessimism), static_argnums=1)
+
+
+def head_values(head):
+    """A head in plain numpy, in float64."""
+    states = numpy_linear(head.state, np.asarray(FEATURES, np.float64))[:, None]
+    hidden = np.tanh(states + numpy_linear(head.action, np.asarray(ACTIONS, np.float64)))
+    return numpy_linear(head.out, hidden)[..., 0]
+
+
+def test_heads_differ_and_the_first_is_what_a_single_one_is():
+    first, second = TWO.heads
+    (only,) = create_q().heads
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(only), strict=True))
+    assert np.abs(head_values(first) - head_values(second)).mean() > 0.1
+
+
+@pytest.mark.parametrize("pessimism", [0.0, 1.0, 2.5])
+def test_several_heads_are_their_mean_less_a_part_of_their_spread(pessimism):
+    values = np.stack([head_values(head) for head in TWO.heads])
+    expected = values.mean(0) - pessimism * values.std(0)
+    np.testing.assert_allclose(values_of(TWO, pessimism), expected, atol=1e-4)
+    if pessimism == 1:  # of two heads, that is the lower one
+        np.testing.assert_allclose(expected, values.min(0), atol=1e-12)
+    # One head has no spread to be pessimistic about.
+    np.testing.assert_array_equal(values_of(create_q(), pessimism), values_of(create_q(), 0.0))
+
+
+def test_the_gradient_is_finite_where_heads_agree_exactly():
+    agreeing = QFunction(None, (TWO.heads[0],) * 2)
+    in_actions = jax.grad(lambda actions, q: jnp.sum(q(FEATURES, actions, 1.0)))
+    in_q = jax.grad(lambda q: jnp.sum(q(FEATURES, ACTIONS, 1.0)))(agreeing)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(in_q))
+    # The slope in the action is that of the head that they both are.
+    np.testing.assert_allclose(in_actions(ACTIONS, agreeing), in_actions(ACTIONS, create_q()), atol=1e-4)
+
+
+@pytest.mark.parametrize("num_heads", [1, 2, 3])
+def test_the_loss_is_the_sum_of_the_heads_mean_squared_errors(num_heads):
+    q = QFunction.create(np.random.default_rng(4), 3, 2, 8, 5, False, num_heads)
+    targets, weights = np.random.default_rng(5).standard_normal(6), np.array([1.0, 1, 0, 1, 0, 1])
+    columns = OBSERVATIONS, ACTIONS[:, 0], *(jnp.asarray(x, jnp.float32) for x in (targets, weights))
+    errors = [((head_values(head)[:, 0] - targets) ** 2)[weights > 0].mean() for head in q.heads]
+    assert float(q_loss(q, CRITIC, QData(*columns), False)) == pytest.approx(sum(errors), rel=1e-4)

@@ -3,10 +3,12 @@ import numpy as np
 import pytest
 
 import ppo_dap
+from dap.dap_made import bits
 from ppo_dap import config as configs
 from ppo_dap.errors import InputError
 from ppo_dap.logs import Logs
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
+from ppo_dap.priors import random_prior
 from ppo_dap.tasks import TaskSpec
 from ppo_dap.training.algorithm import create_learner
 from ppo_dap.training.state import TrainState
@@ -68,3 +70,62 @@ def test_ppo_bc_starts_from_the_logs(tmp_path, hopper_logs, small):
     assert run.config["config"]["warm_start"] == "actor"
     assert run.config["logs_hash"] == hopper_logs.hash()
     assert run.evaluations[0]["return_mean"] > plain.evaluations[0]["return_mean"]
+
+
+def logs_of_good_and_bad():
+    """60 episodes of 50 rows; the 20 good ones earn 1 a row and act +0.5, the others earn 0 and act -0.5 (scaled)."""
+    rng = np.random.default_rng(1)
+    good = np.repeat(rng.permutation(60) < 20, 50)
+    actions = 2 * np.where(good, 0.5, -0.5)[:, None] + 0.02 * rng.standard_normal((3000, 1))
+    observations, ends = rng.standard_normal((3000, 2)).astype(np.float32), np.arange(3000) % 50 == 49
+    return Logs(observations, actions.astype(np.float32), ends, rewards=good.astype(np.float32))
+
+
+@pytest.mark.parametrize(("share", "mean"), [(1.0, -0.5 / 3), (0.3, 0.5)])
+def test_the_filter_shows_the_best_episodes_alone(share, mean):
+    config = configs.make(warm_start="actor", logs_filter=share)
+    state = warm_start(start(config), logs_of_good_and_bad(), SPEC, config)
+    policy = state.policy(SPEC, config.ppo.observation_clip)
+    states = np.random.default_rng(2).standard_normal((100, 2)).astype(np.float32)
+    assert (policy.mean(states)).mean() == pytest.approx(mean, abs=0.08)
+    # The normaliser has seen what the actor has.
+    assert state.observations.count == pytest.approx(3000 * share, rel=0.02)
+
+
+def guided_start(config):
+    learner = create_learner((2, 1), config, random_prior(2, SPEC.action_low, SPEC.action_high).network)
+    return TrainState(learner, RunningMoments.create(2), RewardScale.create(config.ppo.num_envs))
+
+
+def test_q_alone_starts_from_the_returns_and_leaves_actor_and_v_as_they_are():
+    """Rewards are the action's square, so that at gamma 0 that is Q's target, and V's is something else."""
+    logs = made_logs()
+    logs = Logs(logs.observations, logs.actions, logs.episode_ends, rewards=logs.actions[:, 0] ** 2)
+    options = {"warm_start": "actor", "gamma": 0.0, "warm_start_epochs": 60}
+    with_q, without = (configs.make(**options, q_warm_start=q) for q in (True, False))
+    before = guided_start(with_q)
+    after, plain = warm_start(before, logs, SPEC, with_q), warm_start(guided_start(without), logs, SPEC, without)
+    assert bits(after.learner.ppo) == bits(plain.learner.ppo)
+    assert bits(after.learner.ppo.critic) == bits(before.learner.ppo.critic)
+    assert bits(plain.learner.guide) == bits(before.learner.guide)
+    assert all(a != b for a, b in zip(bits(after.learner.guide.q), bits(before.learner.guide.q), strict=True))
+    # PPO scales rewards by what it will see itself, not by the logs.
+    assert after.reward_scale == before.reward_scale
+    observations = (logs.observations - after.observations.mean) / after.observations.std
+    features = after.learner.ppo.critic.features(jnp.asarray(observations, jnp.float32))
+    actions = jnp.asarray(logs.actions / 2)[:, None]
+    values = np.asarray(after.learner.guide.q(features, actions))[:, 0]
+    assert np.corrcoef(values, logs.rewards)[0, 1] > 0.85
+    assert abs(np.corrcoef(before.learner.guide.q(features, actions)[:, 0], logs.rewards)[0, 1]) < 0.5
+
+
+def test_q_and_the_best_episodes_need_rewards_and_q_needs_a_warm_start():
+    logs = made_logs(rewards=False)
+    config = configs.make(warm_start="actor", q_warm_start=True)
+    with pytest.raises(InputError, match="q_warm_start needs logs with rewards; these have none: use warm_start 'acto"):
+        warm_start(guided_start(config), logs, SPEC, config)
+    config = configs.make(warm_start="actor", logs_filter=0.5)
+    with pytest.raises(InputError, match=r"logs_filter 0.5 goes by returns, .*: use logs with rewards, or no filter"):
+        warm_start(start(config), logs, SPEC, config)
+    with pytest.raises(InputError, match="q_warm_start needs a warm_start: 'actor', or 'actor_critic'"):
+        configs.make(q_warm_start=True)

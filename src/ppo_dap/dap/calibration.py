@@ -38,6 +38,8 @@ def calibrate(
     """
     from scipy.optimize import isotonic_regression
 
+    if q.shape != returns.shape:
+        raise ValueError(f"{len(q)} values of Q and {len(returns)} returns: there must be one return for each value")
     order = np.argsort(q, kind="stable")
     sorted_q, sorted_returns = q[order].astype(np.float64), returns[order].astype(np.float64)
     # Knots at equal distances in the values, not in the ranks: the map is read where proposals are, off the data too.
@@ -49,6 +51,8 @@ def calibrate(
         slope, offset = np.polyfit(sorted_q, sorted_returns, 1)
         values = max(slope, 0.0) * knots + (offset if slope > 0 else sorted_returns.mean())
     else:
-        fitted = isotonic_regression(sorted_returns).x
-        values = np.interp(knots, sorted_q, fitted)
+        # Rows of one value are one row, of their mean and number: no map of Q can tell them apart.
+        distinct, place, counts = np.unique(sorted_q, return_inverse=True, return_counts=True)
+        means = np.bincount(place, sorted_returns) / counts
+        values = np.interp(knots, distinct, isotonic_regression(means, weights=counts).x)
     return Calibration(jnp.asarray(knots, jnp.float32), jnp.asarray(values, jnp.float32))

@@ -37,10 +37,13 @@ def q_loss(q: QFunction, critic: Critic | None, rows: QData, shared: bool) -> Fl
 def rank_correlation(
     x: Float[Array, " rows"], y: Float[Array, " rows"], weights: Float[Array, " rows"]
 ) -> Float[Array, ""]:
-    """Spearman's rho (5.7) over the rows with weight; 0 where one of the two does not vary. Ties keep their order."""
+    """Spearman's rho (5.7) over the rows with weight; 0 where one of the two does not vary."""
 
     def ranks(values):
-        return jnp.argsort(jnp.argsort(jnp.where(weights > 0, values, jnp.inf))).astype(jnp.float32)
+        values = jnp.where(weights > 0, values, jnp.inf)
+        # Equal values share the mean of their places: in the rows' order, Q that does not vary would rank by time.
+        below, up_to = (jnp.searchsorted(jnp.sort(values), values, side=side) for side in ("left", "right"))
+        return 0.5 * (below + up_to - 1).astype(jnp.float32)
 
     kept = (weights > 0).astype(jnp.float32)
     a, b = (kept * (r - weighted_mean(r, kept)) for r in (ranks(x), ranks(y)))
