@@ -17,7 +17,7 @@ COMPILED_AFTER = 2
 
 AROUND = {field.name for field in dataclasses.fields(configs.RunConfig)} - {"checkpoint_every"}
 """Settings that do not tell one method from another; where environments restart does."""
-AUDIT = {(True, True): "strictly on-policy", (False, True): "not on-policy, as declared", (False, False): "VIOLATED"}
+AUDIT = {(True, True): "strictly on-policy", (False, True): "not, as declared", (False, False): "VIOLATED"}
 """(strictly on-policy, as its method's row says) -> what a table says."""
 
 
