@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from ppo_dap.commands import runs, stages
+from ppo_dap.commands import runs, stages, studies
 from ppo_dap.commands.options import (
     config_options,
     filter_option,
@@ -167,6 +167,9 @@ def _about_runs(command: Command) -> None:
         "--epochs", type=positive_number, default=40.0, help="T of ALC@T, in 5k steps (default: %(default)s)"
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
+
+    sub = command("study", studies.study, "the paper's tables and figures: run what is missing of their runs")
+    studies.study_options(sub)
 
     _diagnostics(command)
     _collect_options(command)
