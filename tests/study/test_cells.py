@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
@@ -73,7 +74,7 @@ def test_a_setting_that_is_not_in_the_name_is_found():
 
 
 def test_everything_else_is_in_the_name_of_a_run():
-    warm = {"prior": PRIOR, "logs": LOGS, "warm_start": "actor"}
+    warm: dict[str, Any] = {"prior": PRIOR, "logs": LOGS, "warm_start": "actor"}
     other_logs = cells.logs("Hopper-v5", "medium", 1000, 100, 5000)
     found = [
         cells.run("Hopper-v5", "ppo-dap", prior=PRIOR),
@@ -111,7 +112,13 @@ def test_a_setting_that_a_later_version_adds_leaves_names_as_they_are():
 def test_settings_are_those_that_training_resolves(tmp_path):
     import ppo_dap
 
-    small = {"num_envs": 4, "rollout_steps": 128, "minibatch_size": 32, "steps": 128, "eval_episodes": 1}
+    small: dict[str, Any] = {
+        "num_envs": 4,
+        "rollout_steps": 128,
+        "minibatch_size": 32,
+        "steps": 128,
+        "eval_episodes": 1,
+    }
     planned = cells.run("Pendulum-v1", "ppo", "tuned", **small)
     made = ppo_dap.train("Pendulum-v1", "ppo", preset="tuned", out=tmp_path / "run", progress=False, **small)
     stored = made.config["config"]

@@ -19,6 +19,18 @@ def _foreign(folder, number=1):
     (folder / f"claim-{number}").write_text(json.dumps({"host": "elsewhere", "pid": os.getpid(), "started": 1}))
 
 
+def _taken(folder, number):
+    claim = take(folder, number)
+    assert claim is not None
+    return claim
+
+
+def _newest(folder):
+    found = newest(folder)
+    assert found is not None
+    return found
+
+
 def _dead_pid():
     done = subprocess.Popen([sys.executable, "-c", ""])
     done.wait()
@@ -37,7 +49,7 @@ def test_one_of_many_processes_gets_a_claim(tmp_path):
         worker.start()
     for worker in workers:
         worker.join()
-    assert sorted(worker.exitcode for worker in workers) == [0] + [1] * 7
+    assert [worker.exitcode for worker in workers].count(0) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["claim-1"]
 
 
@@ -103,17 +115,17 @@ def test_taking_over_leaves_one_claim_and_the_late_one_loses(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["claim-2"]
     assert not late.holds
     late.release()  # of no effect on who has taken over
-    assert newest(tmp_path).number == 2
-    assert "released" not in newest(tmp_path).content
+    assert _newest(tmp_path).number == 2
+    assert "released" not in _newest(tmp_path).content
 
 
 def test_a_released_claim_is_free(tmp_path):
-    take(tmp_path, 1).release()
+    _taken(tmp_path, 1).release()
     assert Watch(lease=1000.0).free(tmp_path) == 2
 
 
 def test_a_heart_beats_and_notices_who_took_over(tmp_path):
-    claim, lost = take(tmp_path, 1), threading.Event()
+    claim, lost = _taken(tmp_path, 1), threading.Event()
     os.utime(claim.path, (1, 1))
     with Heart(claim, lost.set, every=0.01):
         for _ in range(1000):
@@ -127,7 +139,7 @@ def test_a_heart_beats_and_notices_who_took_over(tmp_path):
 
 
 def test_a_heart_stops_with_its_parent(tmp_path, monkeypatch):
-    claim, lost = take(tmp_path, 1), threading.Event()
+    claim, lost = _taken(tmp_path, 1), threading.Event()
     with Heart(claim, lost.set, every=0.01):
         assert not lost.wait(0.1)
         monkeypatch.setattr(os, "getppid", lambda: 1)

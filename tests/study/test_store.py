@@ -16,6 +16,7 @@ from ppo_dap.errors import InputError
 from ppo_dap.study.claims import Watch, take
 from ppo_dap.study.plan import Plan
 from ppo_dap.study.store import Store, open_store
+from ppo_dap.study.supervise import Supervisor
 from study.store_made import COMMAND, base, contents, small_grid, study, supervisor, target
 
 
@@ -51,13 +52,12 @@ def test_a_worker_refuses_a_cell_whose_needs_are_missing(tmp_path, capsys):
     assert "FileNotFoundError" in done.stderr.splitlines()[-1]
 
 
-def test_two_planners_share_the_work(tmp_path, undisturbed, capsys):
+def test_two_planners_share_the_work(tmp_path, undisturbed, monkeypatch, capsys):
     grid = small_grid()
     both = [supervisor(tmp_path, grid, workers=2) for _ in range(2)]
     started = []
-    for one in both:
-        start = one._start
-        one._start = lambda cell, number, start=start, one=one: (started.append((id(one), cell)), start(cell, number))
+    start = Supervisor._start
+    monkeypatch.setattr(Supervisor, "_start", lambda self, *cell: (started.append(id(self)), start(self, *cell)))
     threads = [threading.Thread(target=one.run) for one in both]
     for thread in threads:
         thread.start()
@@ -66,7 +66,7 @@ def test_two_planners_share_the_work(tmp_path, undisturbed, capsys):
     assert all(len(one.done) == 10 and not one.failed for one in both)
     assert _made(tmp_path) == [1] * 10
     assert contents(tmp_path) == contents(undisturbed)
-    assert len({who for who, _ in started}) == 2
+    assert len(set(started)) == 2
 
 
 def test_without_claims_work_is_done_twice(tmp_path, monkeypatch, capsys):
@@ -137,6 +137,7 @@ def test_a_live_claim_is_waited_for(tmp_path, capsys):
     store, cell = Store(tmp_path), base()
     store.prepare(cell)
     claim = take(store.folder(cell), 1)
+    assert claim is not None
     one = supervisor(tmp_path, study(cell), lease=60.0)
     thread = threading.Thread(target=one.run)
     thread.start()
@@ -156,8 +157,9 @@ def test_a_worker_that_was_taken_for_dead_ends_itself(tmp_path):
     store, cell = Store(tmp_path), base(slow=60.0)
     store.prepare(cell)
     code = (
-        "import sys; from pathlib import Path; from study.stub_worker import make; from ppo_dap.study.store import Store\n"
-        "from ppo_dap.study.worker import work; sys.exit(work(Store(Path(sys.argv[1])), sys.argv[2], 1, make, 0.05))"
+        "import sys; from pathlib import Path; from study.stub_worker import make\n"
+        "from ppo_dap.study.store import Store; from ppo_dap.study.worker import work\n"
+        "sys.exit(work(Store(Path(sys.argv[1])), sys.argv[2], 1, make, 0.05))"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), cell.name])
     while Watch().free(store.folder(cell)) == 1:

@@ -29,7 +29,7 @@ RANDOM = "random"
 """Stands for a prior that needs no cell: the control that proposes anything."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cell:
     """One thing to make. Two cells of the same name are the same."""
 
@@ -56,6 +56,9 @@ class Cell:
 
     def __hash__(self) -> int:
         return hash(self.name)
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self}>"
 
     def __str__(self) -> str:
         """What a person calls it."""
@@ -180,7 +183,8 @@ def _resolved(method: str, preset: str, kind: str | None, gamma: float | None, o
 
 @functools.cache
 def _counted(name: str, value: int) -> int:
-    return configs.flatten(configs.make(**{name: value}))[name]
+    option: dict[str, Any] = {name: value}
+    return configs.flatten(configs.make(**option))[name]
 
 
 _spec = functools.cache(describe)

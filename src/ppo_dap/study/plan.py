@@ -21,7 +21,7 @@ TRAINING_SHARE = 0.7
 GUIDED = 1.5
 """Time of a run with a prior over that of PPO."""
 SECONDS = {"prior": 60.0, "reliability": 120.0}
-RUN_BYTES, PRIOR_BYTES, OTHER_BYTES = 3_000_000, 1_000_000, 100_000
+RUN_BYTES, PRIOR_BYTES, OTHER_BYTES = 3e6, 1e6, 1e5
 
 Speed = Callable[[str], float]
 """Environment steps a second of a task's bare environments."""
@@ -62,7 +62,7 @@ class Plan:
 
     def learn(self, cell: Cell, rates: dict[tuple, tuple[float, int]] | None = None) -> None:
         """Take the cost of a cell that is finished now into the estimates."""
-        rates, seconds = self._rates if rates is None else rates, self.store.cost(cell).get("seconds")
+        rates, seconds = self._rates if rates is None else rates, self.store.cost(cell).get("seconds", 0.0)
         for key in _alike(cell) if seconds else ():
             total, count = rates.get(key, (0.0, 0))
             rates[key] = total + seconds / _work(cell), count + 1

@@ -313,7 +313,7 @@ def audit(s: Scale) -> Entries:
 def mixed(s: Scale) -> Entries:
     """Logs of several gaits: what tells good behaviour from bad, and what keeps to one mode."""
     warm_q = {"warm_start": "actor", "q_warm_start": True}
-    asked = {"fit": {"condition_on": "return"}, "options": {"prior_return": "top"}}
+    asked: dict[str, Any] = {"fit": {"condition_on": "return"}, "options": {"prior_return": "top"}}
     arms = [
         DAP,
         TUNED,

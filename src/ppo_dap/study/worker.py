@@ -105,8 +105,8 @@ def _logs(cell: Mapping[str, Any], out: Path, needs: Mapping[str, Path]) -> None
         link = behaviours / folder.name
         if not link.is_symlink():
             link.symlink_to(os.path.relpath(folder, behaviours))
-    settings = cell["settings"]
-    row = tiers.make_tier(*(settings[name] for name in ("task", "tier", "rows", "seed", "steps")), out)
+    s = cell["settings"]
+    row = tiers.make_tier(s["task"], s["tier"], s["rows"], s["seed"], s["steps"], out)
     # Who needs these logs knows this folder, and not where Minari's rules for names put a dataset in it.
     write_atomically(out / "logs.json", json.dumps({"folder": os.path.relpath(row["out"], out)}).encode())
 
