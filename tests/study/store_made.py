@@ -6,10 +6,10 @@ from pathlib import Path
 from ppo_dap.study import claims
 from ppo_dap.study.cells import Cell
 from ppo_dap.study.claims import Watch
+from ppo_dap.study.grids import Entry, Study
 from ppo_dap.study.plan import Plan
 from ppo_dap.study.show import Show
 from ppo_dap.study.store import Store
-from ppo_dap.study.studies import Entry, Study
 from ppo_dap.study.supervise import Supervisor
 
 COMMAND = (sys.executable, str(Path(__file__).with_name("stub_worker.py")))

@@ -75,7 +75,7 @@ def test_a_setting_that_is_not_in_the_name_is_found():
 
 def test_everything_else_is_in_the_name_of_a_run():
     warm: dict[str, Any] = {"prior": PRIOR, "logs": LOGS, "warm_start": "actor"}
-    other_logs = cells.logs("Hopper-v5", "medium", 1000, 100, 5000)
+    other_logs: Any = cells.logs("Hopper-v5", "medium", 1000, 100, 5000)
     found = [
         cells.run("Hopper-v5", "ppo-dap", prior=PRIOR),
         cells.run("Hopper-v5", "ppo-dap", prior=PRIOR, seed=1),

@@ -106,7 +106,7 @@ def _kill_some(root, times, seed, over):
 
 
 def test_ten_kills_leave_no_trace(tmp_path, capsys):
-    plain, grid = tmp_path / "plain", small_grid(slow=0.06)
+    plain, grid = tmp_path / "plain", small_grid(slow=0.12)
     assert supervisor(plain, grid).run()
     root, over, killed = tmp_path / "killed", threading.Event(), []
     killer = threading.Thread(target=lambda: killed.append(_kill_some(root, 10, 0, over)))
@@ -239,6 +239,35 @@ def test_ctrl_c_ends_the_workers_and_frees_their_cells(tmp_path, capsys):
     one._stop()
     assert [row["end"] for row in one.store.attempts(cell.name)] == ["stopped"]
     assert Watch().free(one.store.folder(cell)) == 2
+
+
+def test_workers_end_with_their_planner_and_another_goes_on(tmp_path, capsys):
+    cell = base(slow=1.5)
+    code = (
+        "import sys; from pathlib import Path; from study.store_made import *\n"
+        "supervisor(Path(sys.argv[1]), study(base(slow=1.5))).run()"
+    )
+    planner = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.DEVNULL)
+    store = Store(tmp_path)
+    while not (store.out(cell) / "last.safetensors").exists():
+        time.sleep(0.02)
+    planner.kill()
+    planner.wait()
+    assert supervisor(tmp_path, study(cell)).run()
+    assert len((store.out(cell) / "table").read_text().splitlines()) == 5
+    assert [row["end"] for row in store.attempts(cell.name)] == ["done"]
+    assert _made(tmp_path) == [1]
+
+
+def test_memory_is_the_workers_own():
+    code = "from ppo_dap.study.worker import peak_mib; {}; print(peak_mib())"
+    held = bytearray(400 * 2**20)  # by the process that starts the others
+    small, large = (
+        float(subprocess.run([sys.executable, "-c", code.format(what)], capture_output=True, text=True).stdout)
+        for what in ("pass", "b = bytearray(b'1') * 300 * 2**20")
+    )
+    assert len(held) > 2**20 * small
+    assert 290 < large - small < 310
 
 
 def test_what_a_kill_left_half_written_is_removed(tmp_path):

@@ -57,4 +57,8 @@ def test_runs_that_are_killed_learn_the_same(tmp_path, capsys):
     killer.join()
     assert killed
     assert _learned(store, cell) == _learned(Store(tmp_path / "plain"), cell)
+    ((labels, run),) = store.runs(grid)
+    assert labels == {"seed": 3}
+    assert run.finished
+    assert Store(tmp_path / "none").runs(grid) == []
     assert store.cost(cell)["peak_mib"] > 50

@@ -10,7 +10,8 @@ import pytest
 from ppo_dap.cli import main
 from ppo_dap.errors import InputError
 from ppo_dap.study import supervise
-from ppo_dap.study.studies import SMOKE, STUDIES, Scale, make_study, only
+from ppo_dap.study.grids import Scale
+from ppo_dap.study.studies import SMOKE, STUDIES, make_study, only
 from ppo_dap.tasks import CATALOGUE
 from study.store_made import COMMAND, base, study
 

@@ -10,8 +10,8 @@ from functools import cached_property
 from typing import Any
 
 from ppo_dap.study.cells import KINDS, Cell
+from ppo_dap.study.grids import Study
 from ppo_dap.study.store import Store
-from ppo_dap.study.studies import Study
 from ppo_dap.tasks import describe
 
 START = 8.0

@@ -20,6 +20,8 @@ from ppo_dap.storage import write_atomically
 
 if TYPE_CHECKING:  # workers need not know what studies are
     from ppo_dap.study.cells import Cell
+    from ppo_dap.study.grids import Study
+    from ppo_dap.training.run import Run
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,13 @@ class Store:
         if not rows:
             return {}
         return {"seconds": sum(row["seconds"] for row in rows), "peak_mib": max(row["peak_mib"] for row in rows)}
+
+    def runs(self, study: Study) -> list[tuple[dict[str, Any], Run]]:
+        """The runs of a study that are there, with their labels."""
+        from ppo_dap.training.run import load_run
+
+        made = [entry for entry in study.entries if entry.cell.kind == "run" and self.done(entry.cell)]
+        return [(entry.labels, load_run(self.out(entry.cell))) for entry in made]
 
     def size(self, cell: Cell) -> int:
         """Bytes of what was made."""
