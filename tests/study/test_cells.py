@@ -86,6 +86,7 @@ def test_everything_else_is_in_the_name_of_a_run():
         cells.run("Hopper-v5", "ppo-dap", prior="random"),
         cells.run("Hopper-v5", "ppo-dap", prior=cells.prior(LOGS, seed=1)),
         cells.run("Hopper-v5", "ppo-dap", prior=cells.prior(LOGS, coverage="narrow")),
+        cells.run("Hopper-v5", "ppo-dap", prior=cells.prior(LOGS, coverage="narrow", coverage_fraction=0.2)),
         cells.run("Hopper-v5", "ppo-dap", prior=cells.prior(LOGS, logs_filter=0.5)),
         cells.run("Hopper-v5", "ppo-dap", prior=cells.prior(other_logs)),
         cells.run("Hopper-v5", "ppo-dap", **warm),

@@ -124,7 +124,7 @@ def test_smoke_is_a_tiny_version_of_all():
     tiny = make_study("smoke")
     assert {e.labels["study"] for e in tiny.entries} == set(STUDIES)
     runs = [cell for cell in tiny.cells() if cell.kind == "run"]
-    assert len(tiny.cells()) < 55
+    assert len(tiny.cells()) < 45
     assert max(cell.settings["steps"] for cell in runs) < 1000
     assert {cell.kind for cell in tiny.cells()} == {"behaviour", "logs", "prior", "run", "reliability"}
     large = {e.labels["method"] for e in make_study("all").entries}

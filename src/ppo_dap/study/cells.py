@@ -122,9 +122,15 @@ def logs(task: str, tier: str, rows: int, seed: int, steps: int) -> Cell:
 
 
 def prior(
-    source: Cell, kind: str = "diffusion", coverage: str = "wide", logs_filter: float = 1.0, seed: int = 0, **options
+    source: Cell,
+    kind: str = "diffusion",
+    coverage: str = "wide",
+    logs_filter: float = 1.0,
+    seed: int = 0,
+    coverage_fraction: float = 0.3,
+    **options: Any,
 ) -> Cell:
-    """A prior of this kind on logs; `options` are fields of the kind's settings."""
+    """A prior of this kind on logs, as `logs.coverage` thins them; `options` are fields of the kind's settings."""
     for what, value, known in (("kind", kind, FITTED), ("coverage", coverage, COVERAGES)):
         if value not in known:
             raise unknown(what, value, known)
@@ -134,7 +140,8 @@ def prior(
             raise unknown(f"option of the {kind} prior", name, own)
     fit = dataclasses.asdict(PRIOR_CONFIGS[kind](**options))
     settings = {"kind": kind, "coverage": coverage, "logs_filter": logs_filter, "seed": seed, **fit}
-    defaults = dataclasses.asdict(PRIOR_CONFIGS[kind]()) | {"logs_filter": 1.0}
+    settings["coverage_fraction"] = coverage_fraction
+    defaults = dataclasses.asdict(PRIOR_CONFIGS[kind]()) | {"logs_filter": 1.0, "coverage_fraction": 0.3}
     return Cell("prior", settings, {"logs": source}, defaults, options)
 
 

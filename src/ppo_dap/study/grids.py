@@ -98,7 +98,10 @@ class Scale:
     def settings(self, settings: Iterable[Setting]) -> list[Setting]:
         """The settings, with the task that stands for all."""
         found = list(settings)
-        return found if self.task is None else [Setting(self.task, found[0].tier)]
+        if self.task is None:
+            return found
+        # One tier for all saves what is slowest; logs of several gaits are a matter of their own.
+        return [Setting(self.task, "mixed" if found[0].tier == "mixed" else "medium-expert")]
 
     def logs(self, setting: Setting) -> Cell:
         """Logs of the setting."""

@@ -132,7 +132,8 @@ def _prior(cell: Mapping[str, Any], out: Path, needs: Mapping[str, Path]) -> Non
 
     settings = cell["settings"]
     found = load_logs(_dataset(needs["logs"]), seed=settings["seed"])
-    found = cover(best_episodes(found, settings["logs_filter"]), settings["coverage"], settings["seed"])
+    found = best_episodes(found, settings["logs_filter"])
+    found = cover(found, settings["coverage"], settings["seed"], settings["coverage_fraction"])
     assert found.task is not None  # tiers say it
     spec = describe(found.task)
     bounds = {"action_low": spec.action_low, "action_high": spec.action_high}
