@@ -206,7 +206,7 @@ def test_a_worker_that_always_dies_is_given_up(tmp_path, capsys):
     cell = base(dies=True)
     one = supervisor(tmp_path, study(cell, target(1)))
     assert not one.run()
-    assert one.failed == {cell: "its worker was killed 5 times (SIGKILL) and got no further"}
+    assert one.failed == {cell: "its worker was killed 12 times (SIGKILL) and got no further"}
     assert len(one.done) == 1
 
 

@@ -23,7 +23,7 @@ COMMAND = (sys.executable, "-m", "ppo_dap.study.worker")
 """What makes a cell, given store, cell and claim."""
 ATTEMPTS = 2
 """A cell that fails this often is given up."""
-DEATHS = 5
+DEATHS = 12
 """So is one whose worker was killed this often without a checkpoint in between."""
 
 
