@@ -40,6 +40,6 @@ def supervisor(root, grid, workers=2, lease=claims.LEASE, command=COMMAND):
 
 
 def contents(root):
-    """Every file of what was made, apart from how long it took."""
-    files = (path for path in Path(root).rglob("*") if path.is_file() and path.name != "attempts.jsonl")
+    """Every file of what was made, apart from how long it took and how often it was begun."""
+    files = (path for path in Path(root).rglob("*") if path.is_file() and path.name not in ("attempts.jsonl", "made"))
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
