@@ -17,7 +17,7 @@ from ppo_dap.cli import main
 from ppo_dap.dap.guidance import energy_weights
 from ppo_dap.errors import InputError
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
-from ppo_dap.priors.prior import DiffusionPrior
+from ppo_dap.priors.prior import Prior
 from ppo_dap.study.guided_run import load_guided
 from ppo_dap.study.reliability_report import (
     FALLBACK,
@@ -46,7 +46,7 @@ def made(tmp_path_factory):
     denoiser = Denoiser.create(np.random.default_rng(0), config, moments[0], moments[1], moments[2], 3)
     one = np.ones(3, np.float32)
     probe = logs.observations[:8].astype(np.float32), logs.actions[:8].astype(np.float32)
-    prior = DiffusionPrior(denoiser, config, -one, one, "Hopper-v5", logs.hash(), {}, *probe)
+    prior = Prior(denoiser, config, -one, one, "Hopper-v5", logs.hash(), {}, *probe)
     prior.save(folder / "prior")
     dataclasses.replace(prior, logs_hash="other").save(folder / "other")
     ppo_dap.train("Hopper-v5", "ppo-dap", prior=prior, out=folder / "run", progress=False, **SMALL)
