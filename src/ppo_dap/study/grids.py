@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from ppo_dap import config as configs
 from ppo_dap.methods import get_method
 from ppo_dap.study import cells
 from ppo_dap.study.cells import Cell, in_order
@@ -114,7 +115,8 @@ class Scale:
     def run(self, setting: Setting, arm: Arm, seed: int, steps: int) -> Cell:
         """A run of an arm."""
         method = get_method(arm.method)
-        guided, warm = method.prior != "none", method.needs_logs or arm.options.get("warm_start", "none") != "none"
+        started = configs.make(arm.preset, **arm.options).warm.warm_start != "none"
+        guided, warm = method.prior != "none", method.needs_logs or started
         options = {**self.run_options, **(self.guided_options if guided else {}), **arm.options}
         return cells.run(
             setting.task,

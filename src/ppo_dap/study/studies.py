@@ -28,10 +28,9 @@ EIGHT = tuple(next((s for s in FOUR if s.task == task), Setting(task, "medium-ex
 MIXED = tuple(Setting(s.task, "mixed") for s in D4RL)
 """Logs of several gaits."""
 
-WARM = {"warm_start": "actor_critic"}
 PPO, PPO_TUNED, BC = Arm("PPO", "ppo"), Arm("PPO (tuned)", "ppo", "tuned"), Arm("PPO + BC", "ppo-bc")
 DAP, TUNED = Arm("PPO-DAP"), Arm("PPO-DAP (tuned)", preset="tuned")
-TUNED_WARM = Arm("PPO-DAP (tuned, warm)", preset="tuned", options=WARM)
+TUNED_WARM = Arm("PPO-DAP (tuned, warm)", preset="tuned-warm", fit={"logs_filter": 0.3})
 NO_PET = Arm("No-PET", "ppo-dap-no-pet", axes={"f": 0})
 NO_VG = Arm("No-VG", "ppo-dap-no-vg")
 VARIANTS = (Arm("PPO-GC", "ppo-gc"), Arm("PPO-ARC", "ppo-arc"), Arm("ABPPO", "ppo-abppo"))
@@ -180,7 +179,13 @@ def mixed(s: Scale) -> Entries:
         Arm("Q warm-started", preset="tuned", options=warm_q),
         TUNED_WARM,
     ]
-    return s.early(MIXED, [PPO, BC, *s.ends(arms)])
+    best = {"logs_filter": 0.3}
+    clones = [
+        BC,
+        Arm("PPO + BC, best 30%", "ppo-bc", options=best),
+        Arm("PPO + BC, best 30%, V started", "ppo-bc", options={**best, "warm_start": "actor_critic"}),
+    ]
+    return s.early(MIXED, [PPO, *s.ends(clones), *s.ends(arms)])
 
 
 STUDIES: dict[str, Callable[[Scale], Entries]] = {
