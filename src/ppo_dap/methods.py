@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ppo_dap.config import Config, field_groups, flatten, replace
+from ppo_dap.config import Config, flatten, replace
 from ppo_dap.errors import InputError, unknown
 
 Fixed = Mapping[str, Any]
@@ -75,7 +75,11 @@ _REASONS = {
     "prior_return_weight": "classifier-free guidance is the diffusion prior's",
     "reuse_batches": "only ppo-arc reuses rows of an earlier policy, and is not strictly on-policy",
 }
-_GUIDED_GROUPS = ("proposals", "q", "adaptation")
+_PARTS = (
+    "guidance", "pet_frequency", "lambda_kl", "lambda_aux", "prior_return", "mode_seeking", "guidance_gate",
+    "q_calibration", "q_warm_start",
+)  # fmt: skip
+"""Options that switch on what only a prior has; the knobs of it are harmless without."""
 _NEEDS: dict[str, tuple[str, Any]] = {
     "clip_slope": ("surrogate", "generalised_clip"),
     "boundary_kl": ("surrogate", "authentic_boundary"),
@@ -133,8 +137,8 @@ def resolve(method: Method, config: Config, given: Mapping[str, Any], kind: str 
 
 
 def _require_effect(name: str, value: Any, method: Method, settings: Mapping[str, Any]) -> None:
-    group, told = field_groups()[name], f"{name} {value!r} has no effect in method {method.name}"
-    if method.prior == "none" and (group in _GUIDED_GROUPS or name in ("lambda_kl", "lambda_aux", "q_warm_start")):
+    told = f"{name} {value!r} has no effect in method {method.name}"
+    if method.prior == "none" and name in _PARTS:
         raise InputError(f"{told}, which has no prior: choose a method that has one, or leave it out")
     needed = _NEEDS.get(name)
     if needed is not None and settings[needed[0]] != needed[1]:

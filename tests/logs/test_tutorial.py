@@ -22,7 +22,9 @@ def test_the_tutorial_runs(tmp_path, monkeypatch, capsys):
 
     fit = ppo_dap.priors.fit_prior
     for module in (ppo_dap, ppo_dap.priors):  # the whole fit takes half a minute
-        monkeypatch.setattr(module, "fit_prior", lambda logs, **options: fit(logs, **QUICK, **options), raising=False)
+        monkeypatch.setattr(
+            module, "fit_prior", lambda logs, *kind, **options: fit(logs, *kind, **QUICK, **options), raising=False
+        )
     monkeypatch.chdir(tmp_path)
     space, printed = {}, ""
     for language, text in blocks():

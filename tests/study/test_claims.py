@@ -1,7 +1,6 @@
 """Claims: one holder at a time, whatever dies, falls silent or is late."""
 
 import json
-import multiprocessing
 import os
 import subprocess
 import sys
@@ -38,19 +37,18 @@ def _dead_pid():
 
 
 def test_one_of_many_processes_gets_a_claim(tmp_path):
-    start = multiprocessing.get_context("fork").Barrier(8)
-
-    def contend():
-        start.wait()
-        sys.exit(0 if take(tmp_path, 1) else 1)
-
-    workers = [multiprocessing.get_context("fork").Process(target=contend) for _ in range(8)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert [worker.exitcode for worker in workers].count(0) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["claim-1"]
+    """Started one after another and let loose together, by a file that they all wait for."""
+    go, folder = tmp_path / "go", tmp_path / "cell"
+    folder.mkdir()
+    code = (
+        "import sys, pathlib\nfrom ppo_dap.study.claims import take\n"
+        f"while not pathlib.Path({str(go)!r}).exists(): pass\n"
+        f"sys.exit(0 if take(pathlib.Path({str(folder)!r}), 1) else 1)"
+    )
+    workers = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(4)]
+    go.touch()
+    assert [worker.wait() for worker in workers].count(0) == 1
+    assert [path.name for path in folder.iterdir()] == ["claim-1"]
 
 
 def test_a_live_claim_is_respected(tmp_path):

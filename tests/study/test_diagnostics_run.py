@@ -46,7 +46,7 @@ def made(tmp_path_factory):
     denoiser = Denoiser.create(np.random.default_rng(0), config, moments[0], moments[1], moments[2], 3)
     one = np.ones(3, np.float32)
     probe = logs.observations[:8].astype(np.float32), logs.actions[:8].astype(np.float32)
-    prior = Prior(denoiser, config, -one, one, "Hopper-v5", logs.hash(), {}, *probe)
+    prior = Prior(denoiser, -one, one, "Hopper-v5", logs.hash(), {}, *probe)
     prior.save(folder / "prior")
     dataclasses.replace(prior, logs_hash="other").save(folder / "other")
     ppo_dap.train("Hopper-v5", "ppo-dap", prior=prior, out=folder / "run", progress=False, **SMALL)

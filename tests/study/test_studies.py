@@ -41,7 +41,8 @@ def test_table_4_is_eight_tasks_by_the_methods_of_the_paper(every):
         found = _runs(table, task=task, method=method, preset="paper")
         assert {e.labels["seed"] for e in found} >= {0, 1, 2}
         assert {e.cell.settings["steps"] for e in found} == {1_000_000}
-    assert len(_runs(table, method="ppo-dap", preset="tuned", task="Ant-v5")) == 6  # with and without a warm start
+    for preset in ("tuned", "tuned-warm"):
+        assert len(_runs(table, method="ppo-dap", preset=preset, task="Ant-v5")) == 3
 
 
 def test_table_5_is_four_settings_with_seeds_for_a_claim(every):
@@ -124,7 +125,7 @@ def test_smoke_is_a_tiny_version_of_all():
     tiny = make_study("smoke")
     assert {e.labels["study"] for e in tiny.entries} == set(STUDIES)
     runs = [cell for cell in tiny.cells() if cell.kind == "run"]
-    assert len(tiny.cells()) < 45
+    assert len(tiny.cells()) < 48
     assert max(cell.settings["steps"] for cell in runs) < 1000
     assert {cell.kind for cell in tiny.cells()} == {"behaviour", "logs", "prior", "run", "reliability"}
     large = {e.labels["method"] for e in make_study("all").entries}

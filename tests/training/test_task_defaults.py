@@ -17,7 +17,7 @@ def resolved(monkeypatch, tmp_path):
             def run(self):
                 pass
 
-        def make(config, spec, prior, logs, folder, description, *rest):
+        def make(config, spec, prior, condition, logs, folder, description, *rest):
             seen.append((config.ppo.gamma, description["config"]["gamma"], description["task"]))
             return Trainer()
 

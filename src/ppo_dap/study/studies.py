@@ -185,7 +185,7 @@ def mixed(s: Scale) -> Entries:
         Arm("PPO + BC, best 30%", "ppo-bc", options=best),
         Arm("PPO + BC, best 30%, V started", "ppo-bc", options={**best, "warm_start": "actor_critic"}),
     ]
-    return s.early(MIXED, [PPO, *s.ends(clones), *s.ends(arms)])
+    return s.early(MIXED, [PPO, *(clones[:1] if s.brief else clones), *s.ends(arms)])
 
 
 STUDIES: dict[str, Callable[[Scale], Entries]] = {
