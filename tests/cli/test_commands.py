@@ -27,7 +27,6 @@ COMMANDS = (
     "bound",
     "methods",
     "reliability",
-    "study",
 )
 
 

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from dap.dap_made import (
-    ACT,
-    DIFFUSION,
     bits,
     iterated,
     learner_of,
@@ -16,6 +14,7 @@ from dap.dap_made import (
     rollout_of,
     schedule_of,
     small_config,
+    small_denoiser,
     violated,
 )
 from ppo_dap.dap import audit
@@ -31,7 +30,7 @@ FRESH = audit.MEASURED[0][1]
 @pytest.fixture(scope="module")
 def arc_stages():
     """PPO's own stage as a run has it; those in which no bit is compared are compiled quickly."""
-    stages = Stages(ARC, None)
+    stages = Stages(ARC, guided=False)
     for name in ("advantages", "policy_metrics", "remember", "previous_rows", "reuse", "contest"):
         setattr(stages, name, quick_jit(getattr(stages, name).__wrapped__))
     return stages
@@ -46,7 +45,7 @@ def iteration(learner, stages, number, config=ARC):
 
 @pytest.mark.parametrize("guided", [False, True])
 def test_a_reused_batch_violates_the_claims_on_ratio_and_advantages_and_no_other(frozen, guided):
-    stages = Stages(ARC, DIFFUSION if guided else None)
+    stages = Stages(ARC, guided=guided)
     claims = prove(learner_of(ARC, guided), frozen if guided else None, ARC, stages)
     assert violated(claims) == {RATIO, ADVANTAGES}
     broken = [claim for claim in claims if not claim.holds]
@@ -57,7 +56,7 @@ def test_a_reused_batch_violates_the_claims_on_ratio_and_advantages_and_no_other
 @pytest.mark.parametrize("surrogate", ["clip", "authentic_boundary", "generalised_clip"])
 def test_without_reuse_every_claim_holds_whatever_the_surrogate(surrogate):
     config = small_config(surrogate=surrogate)
-    claims = prove(learner_of(config, guided=False), None, config, Stages(config, None))
+    claims = prove(learner_of(config, guided=False), None, config, Stages(config, guided=False))
     assert len(claims) == 5
     assert violated(claims) == set()
 
@@ -94,9 +93,9 @@ def test_the_share_of_fresh_rows_falls_where_the_old_ones_won(arc_stages):
 
 def test_the_second_candidates_orders_leave_every_other_draw_as_it_was(config):
     for guided in (False, True):
-        plain, arc = (draw(c, 3, ACT, guided) for c in (config, small_config(reuse_batches=1)))
+        plain, arc = (draw(c, 3, small_denoiser() if guided else None) for c in (config, small_config(reuse_batches=1)))
         assert plain.reuse == ()
         assert bits(arc._replace(reuse=())) == bits(plain)
         assert jax.tree.map(np.shape, arc.reuse) == jax.tree.map(np.shape, arc.actor)
         assert np.any(np.asarray(arc.reuse.rows) != np.asarray(arc.actor.rows))
-        assert bits(draw(small_config(reuse_batches=1), 3, ACT, guided)) == bits(arc)
+        assert bits(draw(small_config(reuse_batches=1), 3, small_denoiser() if guided else None)) == bits(arc)
