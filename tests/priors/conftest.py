@@ -57,12 +57,12 @@ def prior(fitted):
     return fitted("diffusion")
 
 
-@pytest.fixture(params=list(PRIOR_CONFIGS))
+@pytest.fixture(params=list(SMALL))
 def every_prior(request, fitted):
     return fitted(request.param)
 
 
-@pytest.fixture(params=list(PRIOR_CONFIGS))
+@pytest.fixture(params=list(SMALL))
 def labelled(request):
     """A network of each kind, fitted to actions near -0.5 under the label -1 and near 0.5 under the label 1."""
     rng = np.random.default_rng(1)
