@@ -73,21 +73,11 @@ class Planted(eqx.Module):
     count: int = eqx.field(static=True)
     config: PlantedSettings = eqx.field(static=True)
 
-    @staticmethod
-    def create(rng, config, observation_mean, observation_std, action_spread, action_size):
-        raise NotImplementedError
-
     def noise_shape(self, solver, states, num):
         return (states, num, 2)
 
     def sample(self, observations, condition, noise, solver, adapters=None, drift=None, displacement_cap=None):
         return observations.reshape(-1, self.count, 2), jnp.zeros((observations.shape[0], self.count))
-
-    def draw_loss(self, rng, *shape):
-        raise NotImplementedError
-
-    def loss(self, observations, condition, actions, draws, adapters=None):
-        raise NotImplementedError
 
 
 def resampled(candidates, **options):

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,23 @@ def test_exact_denoiser_gives_the_true_distribution(sampler, steps):
     assert two_sample_p(x, truth) > 0.02
     share = np.mean(x[:, 0] > 0)  # the modes lie on either side of 0
     assert abs(share - 0.3) < 3 * np.sqrt(0.3 * 0.7 / 800)
+
+
+@pytest.mark.parametrize(("steps", "spread"), [(20, 0.083), (200, 0.096)])
+def test_eq_8_narrows_a_gaussian_by_what_its_variances_say(steps, spread):
+    """N(0.2, 0.1^2), whose denoiser is a line: the variance after each step is known from the one before."""
+    levels, variance = np.asarray(sigmas_of(steps), np.float64), sigmas_of(steps)[0].astype(float) ** 2
+    for level, below in itertools.pairwise(levels):
+        shrink, share = 0.01 / (0.01 + level**2), (below / level) ** 2
+        variance = (shrink + share * (1 - shrink)) ** 2 * variance + below**2 * (1 - share)
+    assert np.sqrt(variance) == pytest.approx(spread, abs=5e-4)
+
+    def denoise(x, sigma):
+        return 0.2 + 0.01 / (0.01 + sigma**2) * (x - 0.2)
+
+    noise = jax.random.normal(jax.random.key(1), (steps + 1, 1, 20_000, 1))
+    x, _ = jax.jit(lambda noise: ancestral(denoise, sigmas_of(steps), noise))(noise)
+    assert float(jnp.std(x)) == pytest.approx(float(np.sqrt(variance)), rel=0.03)
 
 
 def test_the_two_sample_test_rejects_what_is_wrong():

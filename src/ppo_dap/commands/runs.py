@@ -8,7 +8,7 @@ import functools
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -88,13 +88,7 @@ def reliability(options: argparse.Namespace) -> int:
     names = ("states", "rollouts", "horizon", "checkpoint", "seed")
     given = {name: getattr(options, name) for name in names}
     found = study.reliability(options.folder, options.prior, **given, progress=study.show_progress(options.states))
-    if options.json:
-        print(json.dumps(_without_nan(found.report)))
-    else:
-        study.print_reliability(found.report)
-    if png is not None:
-        study.reliability_figure(found, png)
-    return 0
+    return _diagnosed(found, options.json, study.print_reliability, png, study.reliability_figure)
 
 
 def bound(options: argparse.Namespace) -> int:
@@ -105,12 +99,17 @@ def bound(options: argparse.Namespace) -> int:
 
     png = None if options.png is None else require_png(options.png)
     found = study.bound(options.folder)
-    if options.json:
+    return _diagnosed(found, options.json, study.print_bound, png, study.bound_figure)
+
+
+def _diagnosed(found: Any, as_json: bool, show: Callable, png: Path | None, draw: Callable) -> int:
+    """A diagnosis in words or JSON, and its figure where one is asked for."""
+    if as_json:
         print(json.dumps(_without_nan(found.report)))
     else:
-        study.print_bound(found.report)
+        show(found.report)
     if png is not None:
-        study.bound_figure(found, png)
+        draw(found, png)
     return 0
 
 

@@ -29,6 +29,19 @@ class Calibration(NamedTuple):
         return flat.reshape(q.shape)
 
 
+def isotonic_points(
+    q: Float[np.ndarray, " rows"], returns: Float[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """The never falling function of Q with the least squared error, as the distinct values of Q and its heights there.
+
+    Rows of one value are one row, of their mean and number: no map of Q can tell them apart.
+    """
+    from scipy.optimize import isotonic_regression
+
+    points, place, counts = np.unique(q, return_inverse=True, return_counts=True)
+    return points, isotonic_regression(np.bincount(place, returns) / counts, weights=counts).x
+
+
 def calibrate(
     q: Float[np.ndarray, " rows"], returns: Float[np.ndarray, " rows"], kind: Literal["affine", "isotonic"]
 ) -> Calibration:
@@ -36,23 +49,17 @@ def calibrate(
 
     Raises `ValueError` for rows of different numbers.
     """
-    from scipy.optimize import isotonic_regression
-
     if q.shape != returns.shape:
         raise ValueError(f"{len(q)} values of Q and {len(returns)} returns: there must be one return for each value")
-    order = np.argsort(q, kind="stable")
-    sorted_q, sorted_returns = q[order].astype(np.float64), returns[order].astype(np.float64)
+    q, returns = q.astype(np.float64), returns.astype(np.float64)
     # Knots at equal distances in the values, not in the ranks: the map is read where proposals are, off the data too.
-    low, high = np.quantile(sorted_q, [0.02, 0.98])
+    low, high = np.quantile(q, [0.02, 0.98])
     knots = np.linspace(low, high, KNOTS)
     if not knots[-1] - knots[0] > 1e-6:
         return Calibration.identity()
     if kind == "affine":
-        slope, offset = np.polyfit(sorted_q, sorted_returns, 1)
-        values = max(slope, 0.0) * knots + (offset if slope > 0 else sorted_returns.mean())
+        slope, offset = np.polyfit(q, returns, 1)
+        values = max(slope, 0.0) * knots + (offset if slope > 0 else returns.mean())
     else:
-        # Rows of one value are one row, of their mean and number: no map of Q can tell them apart.
-        distinct, place, counts = np.unique(sorted_q, return_inverse=True, return_counts=True)
-        means = np.bincount(place, sorted_returns) / counts
-        values = np.interp(knots, distinct, isotonic_regression(means, weights=counts).x)
+        values = np.interp(knots, *isotonic_points(q, returns))
     return Calibration(jnp.asarray(knots, jnp.float32), jnp.asarray(values, jnp.float32))

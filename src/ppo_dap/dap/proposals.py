@@ -120,7 +120,7 @@ def propose(
 
     The metric `q_spread` is this batch's, to update the running global scale of Q with.
     """
-    trust = jnp.clip(proposer.q_rank, 0.0, 1.0) if config.guidance_gate else jnp.ones(())
+    trust = jnp.clip(proposer.q_rank, 0.0, 1.0) if config.guidance_gate else None
     candidates, displacement = _sample(proposer, states, draws.noise, trust, config)
     if config.keep_diverse is not None:
         chosen = farthest(candidates, config.keep_diverse)
@@ -128,7 +128,7 @@ def propose(
         displacement = jnp.take_along_axis(displacement, chosen, axis=1)
     candidates = checkpoint_name(jax.lax.stop_gradient(candidates), "proposals")
     values = proposer.value(states.features, candidates, config)
-    weights = _weights(proposer, states, candidates, values, beta * trust, config)
+    weights = _weights(proposer, states, candidates, values, beta if trust is None else beta * trust, config)
     if weighted(config):
         chosen = resample(weights, draws.resample)
     else:
@@ -167,7 +167,7 @@ def _sample(proposer: Proposer, states: States, noise, trust, config: ProposalCo
         def value(actions):
             return proposer.value(states.features, actions, config)
 
-        drift = q_drift(value, prior.config.sigma_max, config, trust if config.guidance_gate else None)
+        drift = q_drift(value, prior.config.sigma_max, config, trust)
     return prior.sample(
         states.raw_observations,
         conditions(proposer.condition, states.observations.shape[0]),

@@ -11,6 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
+from ppo_dap.dap.calibration import isotonic_points
+
 Map = Callable[[np.ndarray], np.ndarray]
 """A calibration: Q as it is to Q as it should be."""
 RESAMPLES = 2000
@@ -105,12 +107,8 @@ def affine_map(q: Float[np.ndarray, " n"], g: Float[np.ndarray, " n"]) -> Map:
 
 def isotonic_map(q: Float[np.ndarray, " n"], g: Float[np.ndarray, " n"]) -> Map:
     """The rising function nearest to (Q, G) by least squares, linear between its points and constant outside them."""
-    from scipy.optimize import isotonic_regression
-
-    points, inverse, counts = np.unique(q, return_inverse=True, return_counts=True)
-    means = np.bincount(inverse, weights=g) / counts
-    heights = isotonic_regression(means, weights=counts).x
-    return lambda x: np.interp(x, points, heights)
+    points = isotonic_points(q, g)
+    return lambda x: np.interp(x, *points)
 
 
 MAPS: dict[str, Callable[[np.ndarray, np.ndarray], Map]] = {
