@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from ppo_dap.commands import runs, stages
+from ppo_dap.commands import runs, stages, studies
 from ppo_dap.commands.options import (
     config_options,
     filter_option,
@@ -177,6 +177,9 @@ def _about_runs(command: Command) -> None:
     sub.add_argument("--markdown", action="store_true", help="print the comparison as Markdown")
     sub.add_argument("--csv", metavar="FILE", help="write the rows to a .csv as well")
     sub.add_argument("--json", action="store_true", help="print JSON")
+
+    sub = command("study", studies.study, "the paper's tables and figures: run what is missing of their runs")
+    studies.study_options(sub)
 
     _diagnostics(command)
     _collect_options(command)

@@ -1,0 +1,45 @@
+"""Small grids of stubs, and a supervisor whose workers make these (stub_worker.py)."""
+
+import sys
+from pathlib import Path
+
+from ppo_dap.study import claims
+from ppo_dap.study.cells import Cell
+from ppo_dap.study.claims import Watch
+from ppo_dap.study.grids import Entry, Study
+from ppo_dap.study.plan import Plan
+from ppo_dap.study.show import Show
+from ppo_dap.study.store import Store
+from ppo_dap.study.supervise import Supervisor
+
+COMMAND = (sys.executable, str(Path(__file__).with_name("stub_worker.py")))
+
+
+def base(number=0, **how):
+    """What a stub makes first: lines that depend on its settings."""
+    return Cell("behaviour", {"task": "Hopper-v5", "seed": number, "steps": 5, **how})
+
+
+def target(number, need=None, **how):
+    settings = {"task": "Hopper-v5", "method": "ppo", "preset": "paper", "seed": number, "steps": 5, **how}
+    return Cell("run", settings, {"prior": need} if need else {})
+
+
+def study(*cells):
+    return Study("stub", "a stub", 1.0, tuple(Entry(cell, {"seed": cell.settings.get("seed", 0)}) for cell in cells))
+
+
+def small_grid(**how):
+    """Two first cells, and four runs on each."""
+    return study(*(target(10 * b + i, base(b, **how), **how) for b in range(2) for i in range(4)))
+
+
+def supervisor(root, grid, workers=2, lease=claims.LEASE, command=COMMAND):
+    plan = Plan(grid, Store(root), lambda task: 1e9)
+    return Supervisor(plan, workers, Show(), command, Watch(lease), poll=0.05)
+
+
+def contents(root):
+    """Every file of what was made, apart from how long it took and how often it was begun."""
+    files = (path for path in Path(root).rglob("*") if path.is_file() and path.name not in ("attempts.jsonl", "made"))
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
