@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ppo_dap.errors import InputError, unknown
-from ppo_dap.fields import AT_LEAST_0, POSITIVE, SHARE, Rule, validate_fields
+from ppo_dap.fields import AT_LEAST_0, POSITIVE, SHARE, Rule, type_hints, validate_fields
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def field_groups() -> dict[str, str]:
     """Flat field name -> name of its group in `Config`."""
-    groups = typing.get_type_hints(Config)
+    groups = type_hints(Config)
     return {f.name: group for group, cls in groups.items() for f in dataclasses.fields(cls)}
 
 
@@ -302,7 +302,7 @@ _RULES: dict[str, Rule] = {
 
 def validate(config: Config) -> None:
     """Raise `InputError` for the first field whose type or value cannot work, naming what would be right."""
-    for group in typing.get_type_hints(Config):
+    for group in type_hints(Config):
         validate_fields(getattr(config, group), _RULES)
     ppo = config.ppo
     if ppo.rollout_steps % ppo.num_envs:
@@ -325,8 +325,8 @@ def validate(config: Config) -> None:
 
 _FLOATS = frozenset(
     f.name
-    for cls in typing.get_type_hints(Config).values()
+    for cls in type_hints(Config).values()
     for f in dataclasses.fields(cls)
-    if float in (typing.get_args(typing.get_type_hints(cls)[f.name]) or (typing.get_type_hints(cls)[f.name],))
+    if float in (typing.get_args(type_hints(cls)[f.name]) or (type_hints(cls)[f.name],))
 )
 """Fields that take a number; a whole one given for it becomes a float."""

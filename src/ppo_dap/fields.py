@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import typing
 from collections.abc import Callable, Mapping
@@ -18,9 +19,13 @@ AT_LEAST_0: Rule = (lambda v: v >= 0, "a number of 0 or more")
 SHARE: Rule = (lambda v: 0 < v <= 1, "a number above 0 and at most 1")
 
 
+type_hints = functools.cache(typing.get_type_hints)
+"""A class's own, evaluated once: a study checks thousands of settings."""
+
+
 def validate_fields(settings: Any, rules: Mapping[str, Rule]) -> None:
     """Raise `InputError` for the first field of a dataclass whose type or value cannot work; it says what would."""
-    hints = typing.get_type_hints(type(settings))
+    hints = type_hints(type(settings))
     for field in dataclasses.fields(settings):
         _validate(field.name, getattr(settings, field.name), hints[field.name], rules.get(field.name))
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ppo_dap import config as configs
+from ppo_dap.fields import type_hints
 from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 
 
@@ -85,7 +86,7 @@ def filter_option(parser: argparse.ArgumentParser) -> None:
 
 def config_options(parser: argparse.ArgumentParser) -> None:
     """A flag for every field of the config, by its name; what is not given stays with the preset."""
-    for group, cls in typing.get_type_hints(configs.Config).items():
+    for group, cls in type_hints(configs.Config).items():
         field_options(parser.add_argument_group(f"{group}: {(cls.__doc__ or '').splitlines()[0]}"), cls)
 
 
@@ -107,7 +108,7 @@ def field_options(section: Any, cls: type, shared: Mapping[str, Sequence[str]] |
 
     `shared` names the fields to take, and the kinds of prior that have each.
     """
-    hints, texts = typing.get_type_hints(cls), field_docstrings(cls)
+    hints, texts = type_hints(cls), field_docstrings(cls)
     for f in dataclasses.fields(cls):
         if shared is not None and f.name not in shared:
             continue
