@@ -10,9 +10,7 @@ from ppo_dap import config as configs
 from ppo_dap.methods import get_method
 from ppo_dap.study import cells
 from ppo_dap.study.cells import Cell, in_order
-
-EPOCH = 5_000
-"""Environment steps of one epoch (5.1.1)."""
+from ppo_dap.study.statistics import EPOCH
 
 
 class Setting(NamedTuple):

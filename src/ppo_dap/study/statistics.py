@@ -17,7 +17,7 @@ from ppo_dap.errors import InputError
 from ppo_dap.tasks.catalogue import CATALOGUE, NAMESPACED
 
 EPOCH = 5_000
-"""Environment steps of one epoch."""
+"""Environment steps of one epoch (5.1.1)."""
 REPS = 2_000
 """Resamples of a bootstrap interval."""
 

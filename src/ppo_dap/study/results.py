@@ -1,0 +1,197 @@
+"""What is kept of a store's runs when their folders are gone: small CSV files that every table and figure is made from.
+
+runs.csv         a row a run: what it was, what it cost, what its audit and its proposals measured
+evaluations.csv  a row an evaluation: cell, env_steps, return_mean, length_mean
+reports.csv      a row a reliability report (5.7)
+
+Rows are named by their cell, so studies share them; labels come from the studies themselves.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ppo_dap.errors import InputError
+from ppo_dap.storage import write_atomically
+from ppo_dap.study.statistics import EPOCH, alc
+
+if TYPE_CHECKING:
+    from ppo_dap.study.cells import Cell
+    from ppo_dap.study.grids import Study
+    from ppo_dap.study.store import Store
+    from ppo_dap.training.run import Run
+
+Row = dict[str, Any]
+MEANS = ("ess", "high_q_rate", "acceptance", "guided_displacement", "q_rank", "policy_kl", "prior_kl", "kl_to_prior")
+"""Metrics of which a run's mean over its iterations is kept, NaN left out."""
+WORST = {"spr": min, "pgshare": min, "oglr": max, "batch_fresh": min}
+"""Measures of the audit (5.8), each by its worst iteration."""
+WORDS = ("cell", "of", "task", "logs", "method", "preset", "options")
+"""Columns whose values are no numbers, whatever they look like."""
+SETTLED = 2
+"""Iterations in which programs are compiled: their seconds are no part of a run's cost."""
+
+
+@dataclass
+class Results:
+    """What was measured, by the name of its cell."""
+
+    runs: dict[str, Row] = field(default_factory=dict)
+    curves: dict[str, list[Row]] = field(default_factory=dict)
+    """Evaluations: rows of env_steps, return_mean, length_mean."""
+    reports: dict[str, Row] = field(default_factory=dict)
+
+    def rows(self, study: Study, **wanted: Any) -> list[Row]:
+        """A row for each entry of the study that is a finished run and has these labels.
+
+        Its labels, `label` (the arm, for `compare`), `run` (the cell), `alc` at the study's T and everything that
+        runs.csv says of it; `alc` is None for a run whose evaluations end before T.
+        """
+        found = []
+        for entry in study.entries:
+            labels, name = entry.labels, entry.cell.name
+            if name not in self.runs or any(labels.get(key) != value for key, value in wanted.items()):
+                continue
+            curve = self.curves[name]
+            reached = bool(curve) and curve[-1]["env_steps"] >= study.epochs * EPOCH
+            row = {"run": name, "label": labels["arm"], "finished": True} | self.runs[name] | labels
+            found.append(row | {"alc": alc(curve, study.epochs) if reached else None})
+        return found
+
+    def save(self, folder: Path) -> None:
+        """Write the three files; rows are in the order of their cells' names, so that a file changes where runs do."""
+        for name, rows in (
+            ("runs.csv", [{"cell": cell} | self.runs[cell] for cell in sorted(self.runs)]),
+            ("evaluations.csv", [{"cell": cell} | row for cell in sorted(self.curves) for row in self.curves[cell]]),
+            ("reports.csv", [{"cell": cell} | self.reports[cell] for cell in sorted(self.reports)]),
+        ):
+            if rows:
+                write_atomically(folder / name, _csv(rows).encode())
+
+
+def load_results(folder: Path) -> Results:
+    """What `Results.save` wrote; empty where there is nothing. Raises `InputError` for a file that is damaged."""
+    found = Results()
+    for row in _read(folder / "runs.csv"):
+        found.runs[row.pop("cell")] = row
+    for row in _read(folder / "evaluations.csv"):
+        found.curves.setdefault(row.pop("cell"), []).append(row)
+    for row in _read(folder / "reports.csv"):
+        found.reports[row.pop("cell")] = row
+    lacking = found.runs.keys() ^ found.curves.keys()
+    if lacking:
+        raise InputError(f"{folder}: runs.csv and evaluations.csv must name the same cells; one lacks {min(lacking)}")
+    return found
+
+
+def gather(store: Store, cells: Iterable[Cell], results: Results) -> Results:
+    """`results` with what the store has made of these cells since."""
+    from ppo_dap.training.run import load_run
+
+    for cell in cells:
+        if not store.done(cell):
+            continue
+        if cell.kind == "run" and cell.name not in results.runs:
+            run = load_run(store.out(cell))
+            results.runs[cell.name] = _identity(cell) | _measured(run) | store.cost(cell)
+            results.curves[cell.name] = [
+                {name: row[name] for name in ("env_steps", "return_mean", "length_mean")} for row in run.evaluations
+            ]
+        if cell.kind == "reliability" and cell.name not in results.reports:
+            report = json.loads(store.artefact(cell).read_text())
+            results.reports[cell.name] = {"of": cell.needs["run"].name} | dict(_flat(report))
+    return results
+
+
+def _identity(cell: Cell) -> Row:
+    """What a person who reads the file wants to know of a run."""
+    call = {name: value for name, value in cell.call.items() if name not in ("seed", "steps", "tensorboard")}
+    source = cell.needs.get("prior", cell).needs.get("logs")
+    return {
+        "task": cell.settings["task"],
+        "logs": "" if source is None else source.settings["tier"],
+        "method": cell.settings["method"],
+        "preset": cell.settings["preset"],
+        "options": " ".join(f"{name}={value}" for name, value in call.items()),
+        "seed": cell.settings["seed"],
+        "steps": cell.settings["steps"],
+    }
+
+
+def _measured(run: Run) -> Row:
+    """What a run's tables say in all."""
+    metrics, evaluations = run.metrics, run.evaluations
+    strictly, declared = run.verdict()
+    found: Row = {"last_return": evaluations[-1]["return_mean"], "last_length": evaluations[-1]["length_mean"]}
+    found["strictly_on_policy"], found["as_declared"] = strictly, declared
+    settled = metrics[SETTLED:]
+    found["env_steps"] = settled[-1]["env_steps"] - metrics[SETTLED - 1]["env_steps"] if settled else 0
+    parts = sorted({name for row in settled for name in row if name.startswith("seconds_")})
+    found |= {name: sum(row.get(name, 0.0) for row in settled) for name in parts}
+    for name in MEANS:
+        values = [row[name] for row in metrics if _number(row.get(name))]
+        found[name] = sum(values) / len(values) if values else None
+    for name, worst in WORST.items():
+        values = [row[name] for row in metrics if _number(row.get(name))]
+        found[name] = worst(values) if values else None
+    return found
+
+
+def _number(value: Any) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    """The numbers of a nested report, by the path to each."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, bool | int | float | str) or value is None:
+            yield prefix + name, value
+
+
+def _csv(rows: list[Row]) -> str:
+    file = io.StringIO()
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
+    return file.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    return "" if value is None else f"{value:.7g}" if isinstance(value, float) else value
+
+
+def _read(path: Path) -> list[Row]:
+    if not path.is_file():
+        return []
+    with open(path, newline="") as file:
+        try:
+            rows = list(csv.DictReader(file, strict=True))
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise InputError(f"{path} is damaged ({error}): make it again with ppo-dap study") from error
+    for row in rows:
+        if "cell" not in row or None in row or None in row.values():  # a line that is too long, or too short
+            raise InputError(f"{path} is damaged at {list(row.values())[:3]}: make it again with ppo-dap study")
+    return [{name: text if name in WORDS else _value(text) for name, text in row.items()} for row in rows]
+
+
+def _value(text: str) -> Any:
+    if not text:
+        return None
+    if text in ("True", "False"):
+        return text == "True"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
