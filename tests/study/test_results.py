@@ -32,7 +32,12 @@ def store(tmp_path):
     config = {"task": "Pendulum-v1", "method": "ppo", "prior_hash": None, "config": {"pet_frequency": 0, "steps": 8000}}
     (out / "config.json").write_text(json.dumps(config))
     (out / "audit.json").write_text(json.dumps({"static": []}))
-    rows = [_metrics(0, ess=None), _metrics(1, ess=2.0), _metrics(2, spr=0.5, oglr=0.25, batch_fresh=0.5), _metrics(3, ess=math.nan)]
+    rows = [
+        _metrics(0, ess=None),
+        _metrics(1, ess=2.0),
+        _metrics(2, spr=0.5, oglr=0.25, batch_fresh=0.5),
+        _metrics(3, ess=math.nan),
+    ]
     (out / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (out / "evaluations.jsonl").write_text("".join(json.dumps(row) + "\n" for row in EVALUATIONS))
     store.finish(done.name)

@@ -9,6 +9,7 @@ import pytest
 
 from ppo_dap.cli import main
 from ppo_dap.errors import InputError
+from ppo_dap.methods import METHODS
 from ppo_dap.study import supervise
 from ppo_dap.study.grids import Scale
 from ppo_dap.study.studies import SMOKE, STUDIES, make_study, only
@@ -48,7 +49,7 @@ def test_table_4_is_eight_tasks_by_the_methods_of_the_paper(every):
 def test_table_5_is_four_settings_with_seeds_for_a_claim(every):
     table = every["table5"]
     assert _settings(table, "early") == _settings(table, "full") == FOUR
-    arms = {"PPO", "PPO (tuned)", "PPO + BC", "PPO-DAP", "PPO-DAP (tuned)", "PPO-DAP (tuned, warm)"}
+    arms = {"PPO", "PPO + BC", "PPO-DAP", "PPO-DAP (tuned)", "PPO-DAP (tuned-warm)"}
     for (task, _), arm in itertools.product(FOUR, arms):
         found = _runs(table, task=task, arm=arm, part="early")
         assert [e.labels["seed"] for e in found] == list(range(8))
@@ -70,7 +71,29 @@ def test_the_axes_are_those_of_the_paper(every):
     methods = {e.labels["method"] for e in every["table7"].entries}
     assert methods == {"ppo", "ppo-bc", "ppo-dap", "ppo-dap-no-vg", "ppo-dap-no-pet", "ppo-vae"}
     assert {e.labels["logs"] for e in every["mixed"].entries} == {"mixed"}
+    assert {e.labels["method"] for e in every["mixed"].entries} == set(METHODS)
     assert {"report"} < {e.labels["part"] for e in every["reliability"].entries}
+
+
+def test_each_part_of_the_warm_start_is_one_setting_away(every):
+    whole, *_ = _runs(every["mixed"], arm="PPO-DAP (tuned-warm)", task="Hopper-v5", seed=0)
+    parts = [e for e in _runs(every["mixed"], task="Hopper-v5", seed=0) if "(tuned-warm): " in e.labels["arm"]]
+    away = {}
+    for entry in parts:
+        differ = {k for k, v in entry.cell.settings.items() if whole.cell.settings[k] != v}
+        before = whole.cell.needs["prior"].settings
+        fitted = {k for k, v in entry.cell.needs["prior"].settings.items() if before[k] != v}
+        away[entry.labels["arm"].split(": ")[1]] = differ | fitted
+    assert away["no guidance"] == {"guidance"}
+    assert away["no PET"] == {"pet_frequency"}
+    assert away["V not started"] == away["nothing started"] == {"warm_start"}
+    assert away["all logs"] == {"logs_filter"}
+    assert away["mode-seeking imitation"] == away["imitation beside the KL"] | {"mode_seeking"}
+    assert all(away.values())
+
+
+def test_names_can_be_chosen_by_from_a_list_with_commas(every):
+    assert not [v for grid in every.values() for e in grid.entries for v in map(str, e.labels.values()) if "," in v]
 
 
 def test_labels_say_what_the_cell_is(every):

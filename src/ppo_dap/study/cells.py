@@ -69,7 +69,8 @@ class Cell:
             return f"logs {s['tier']} of {s['task']}, {s['rows']:,} rows"
         if self.kind == "prior":
             source = self.needs["logs"].settings
-            extra = "".join(f" {k} {v}" for k, v in self.call.items())
+            extra = "" if s["logs_filter"] == 1 else f", best {s['logs_filter']:.0%}"
+            extra += "".join(f", {k} {v}" for k, v in self.call.items())
             return f"{s['kind']} prior on {s['coverage']} {source['tier']} logs of {source['task']}{extra}"
         if self.kind == "reliability":
             return f"reliability of {self.needs['run']}"

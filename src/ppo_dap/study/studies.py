@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from ppo_dap.errors import InputError, unknown
-from ppo_dap.methods import get_method
+from ppo_dap.methods import METHODS, get_method
 from ppo_dap.study import cells
 from ppo_dap.study.grids import Arm, Entry, Scale, Setting, Study
 from ppo_dap.tasks import CATALOGUE
@@ -25,12 +25,12 @@ FOUR = (*D4RL, STANDUP)
 """Table 5. For HumanoidStandup the paper says self-collected and no more."""
 EIGHT = tuple(next((s for s in FOUR if s.task == task), Setting(task, "medium-expert")) for task in CATALOGUE)
 """Table 4. Where the paper names no tier, it is medium-expert."""
-MIXED = tuple(Setting(s.task, "mixed") for s in D4RL)
+MIXED = tuple(Setting(s.task, "mixed") for s in (WALKER, HOPPER))
 """Logs of several gaits."""
 
-PPO, PPO_TUNED, BC = Arm("PPO", "ppo"), Arm("PPO (tuned)", "ppo", "tuned"), Arm("PPO + BC", "ppo-bc")
+PPO, BC = Arm("PPO", "ppo"), Arm("PPO + BC", "ppo-bc")
 DAP, TUNED = Arm("PPO-DAP"), Arm("PPO-DAP (tuned)", preset="tuned")
-TUNED_WARM = Arm("PPO-DAP (tuned, warm)", preset="tuned-warm", fit={"logs_filter": 0.3})
+TUNED_WARM = Arm("PPO-DAP (tuned-warm)", preset="tuned-warm", fit={"logs_filter": 0.3})
 NO_PET = Arm("No-PET", "ppo-dap-no-pet", axes={"f": 0})
 NO_VG = Arm("No-VG", "ppo-dap-no-vg")
 VARIANTS = (Arm("PPO-GC", "ppo-gc"), Arm("PPO-ARC", "ppo-arc"), Arm("ABPPO", "ppo-abppo"))
@@ -38,12 +38,25 @@ THIN: dict[str, Any] = {"coverage_fraction": 0.2}
 """Share of the rows at the levels below wide. Of medium-expert logs, whose best episodes are long, those of middling
 return hold little more than a quarter."""
 MITIGATIONS = {
-    "gate, beta 0.6": {"guidance_gate": True, "beta_max": 0.6},
-    "K 20, the 10 most diverse": {"num_proposals": 20, "keep_diverse": 10},
+    "gate and beta 0.6": {"guidance_gate": True, "beta_max": 0.6},
+    "K 20 with the 10 most diverse": {"num_proposals": 20, "keep_diverse": 10},
     "alpha 0.2": {"alpha_max": 0.2},
     "Q calibrated": {"q_calibration": "affine"},
 }
 """What 5.6 recommends for narrow logs."""
+PARTS: tuple[tuple[str, dict[str, Any], dict[str, Any]], ...] = (
+    ("no guidance", {"guidance": "none"}, {}),
+    ("no PET", {"pet_frequency": 0}, {}),
+    ("V not started", {"warm_start": "actor"}, {}),
+    ("nothing started", {"warm_start": "none"}, {}),
+    ("all logs", {"logs_filter": 1.0}, {"logs_filter": 1.0}),
+    ("KL never decayed", {"lambda_decay": None}, {}),
+    ("imitation beside the KL", {"lambda_aux": 0.3}, {}),
+    ("mode-seeking imitation", {"lambda_aux": 0.3, "mode_seeking": 1.0}, {}),
+    ("Q started", {"q_warm_start": True}, {}),
+    ("asked for the top return", {"prior_return": "top"}, {"condition_on": "return", "logs_filter": 1.0}),
+)
+"""What PPO-DAP (tuned-warm) is without a part, or with one more: (name, its options, those of its prior)."""
 
 Entries = Iterable[Entry]
 
@@ -55,7 +68,7 @@ def table4(s: Scale) -> Entries:
 
 def table5(s: Scale) -> Entries:
     """Early efficiency and final return, four settings."""
-    arms = [PPO, PPO_TUNED, BC, DAP, TUNED, TUNED_WARM]
+    arms = [PPO, BC, DAP, TUNED, TUNED_WARM]
     yield from s.early(FOUR, arms, s.many)
     yield from s.full(FOUR, arms)
 
@@ -128,7 +141,7 @@ def coverage(s: Scale) -> Entries:
     every = {"all four": {k: v for options in MITIGATIONS.values() for k, v in options.items()}}
     axes = {"coverage": "narrow"}
     arms = [
-        Arm(f"narrow logs, {name}", options=options, fit=_fit("narrow"), axes=axes | {"mitigation": name})
+        Arm(f"narrow logs: {name}", options=options, fit=_fit("narrow"), axes=axes | {"mitigation": name})
         for name, options in (every if s.brief else MITIGATIONS | every).items()
     ]
     yield from fig12(s)
@@ -144,10 +157,10 @@ def ablation(s: Scale) -> Entries:
             options |= {} if f in (0, 10) else {"pet_frequency": f}
             method = "ppo-dap-no-pet" if f == 0 else "ppo-dap"
             axes = {"prior": "diffusion", "guidance": guidance, "f": f}
-            arms.append(Arm(f"diffusion, {guidance}, f={f}", method, options=options, axes=axes))
+            arms.append(Arm(f"diffusion / {guidance} / f={f}", method, options=options, axes=axes))
     for guidance in ("energy",) if s.brief else ("none", "energy"):
         axes = {"prior": "flow", "guidance": guidance, "f": 0}
-        arms.append(Arm(f"flow, {guidance}", "ppo-flow", options={"guidance": guidance}, axes=axes))
+        arms.append(Arm(f"flow / {guidance}", "ppo-flow", options={"guidance": guidance}, axes=axes))
     controls = ("ppo-dap-prior-kl-only", "ppo-dap-aux-only", "ppo-behavior-kl", "ppo-vae", "ppo-retrieval")
     arms += [Arm(get_method(name).row, name) for name in (controls[:1] if s.brief else controls)]
     yield from s.early(D4RL, [PPO._replace(axes={"prior": "none"}), Arm("PPO + AWR", "ppo-awr")])
@@ -168,24 +181,20 @@ def audit(s: Scale) -> Entries:
 
 
 def mixed(s: Scale) -> Entries:
-    """Logs of several gaits: what tells good behaviour from bad, and what keeps to one mode."""
-    warm_q = {"warm_start": "actor", "q_warm_start": True}
-    asked: dict[str, Any] = {"fit": {"condition_on": "return"}, "options": {"prior_return": "top"}}
-    arms = [
-        DAP,
-        TUNED,
-        Arm("mode-seeking", preset="tuned", options={"mode_seeking": 1.0}),
-        Arm("asked for the top return", preset="tuned", **asked),
-        Arm("Q warm-started", preset="tuned", options=warm_q),
-        TUNED_WARM,
-    ]
+    """Logs of several gaits: every method, the clones of the best logs, and PPO-DAP (tuned-warm) without each part."""
     best = {"logs_filter": 0.3}
     clones = [
-        BC,
-        Arm("PPO + BC, best 30%", "ppo-bc", options=best),
-        Arm("PPO + BC, best 30%, V started", "ppo-bc", options={**best, "warm_start": "actor_critic"}),
+        Arm("PPO + BC (best 30%)", "ppo-bc", options=best),
+        Arm("PPO + BC (best 30%; V started)", "ppo-bc", options={**best, "warm_start": "actor_critic"}),
     ]
-    return s.early(MIXED, [PPO, *(clones[:1] if s.brief else clones), *s.ends(arms)])
+    yield from s.early(MIXED, [TUNED_WARM, BC, *clones[s.brief :], PPO], s.many)
+    parts = [
+        TUNED_WARM._replace(name=f"{TUNED_WARM.name}: {name}", options=options, fit={**TUNED_WARM.fit, **fit})
+        for name, options, fit in PARTS
+    ]
+    yield from s.early(MIXED, s.ends(parts))
+    if not s.brief:
+        yield from s.early(MIXED, [Arm(m.row, m.name) for m in METHODS.values() if m.name not in ("ppo", "ppo-bc")])
 
 
 STUDIES: dict[str, Callable[[Scale], Entries]] = {
