@@ -187,7 +187,7 @@ def mixed(s: Scale) -> Entries:
         Arm("PPO + BC (best 30%)", "ppo-bc", options=best),
         Arm("PPO + BC (best 30%; V started)", "ppo-bc", options={**best, "warm_start": "actor_critic"}),
     ]
-    yield from s.early(MIXED, [TUNED_WARM, BC, *clones[s.brief :], PPO], s.many)
+    yield from s.early(MIXED, [TUNED_WARM, BC, *([] if s.brief else clones), PPO], s.many)
     parts = [
         TUNED_WARM._replace(name=f"{TUNED_WARM.name}: {name}", options=options, fit={**TUNED_WARM.fit, **fit})
         for name, options, fit in PARTS
