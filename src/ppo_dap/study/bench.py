@@ -200,7 +200,8 @@ def print_bench(figures: Mapping[str, Any]) -> None:
     Console(width=None if sys.stdout.isatty() else 100).print(table)
     machine = figures["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items() if version)
-    print(f"{machine['processor']}, {machine['cores']} cores; Python {machine['python']}, {versions}")
+    device = "" if machine["device"] == "cpu" else f", {machine['device']}"
+    print(f"{machine['processor']}, {machine['cores']} cores{device}; Python {machine['python']}, {versions}")
     print(f"{figures['command']}   ({machine['seconds']:,.0f} s)")
 
 
