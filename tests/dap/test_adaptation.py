@@ -99,6 +99,15 @@ def test_pet_spr_is_the_worst_share_of_a_minibatch_from_d_on(pet, rows, states):
     assert float(pet(stale, 1)[1][2]["pet_spr"]) == 0
 
 
+def test_pet_spr_of_fresh_rows_is_exactly_1_for_a_minibatch_whose_reciprocal_is_rounded(rows):
+    config = AdaptationConfig(pet_minibatch_size=41)
+    assert float(jax.jit(jnp.mean)(jnp.ones(41))) != 1  # the planted fault: what it must not be
+    start = init_adapters(np.random.default_rng(1), small_denoiser(), "lora", 2)
+    draws = PETDraws.make(np.random.default_rng(2), small_denoiser(), 10, config)
+    run = quick_jit(partial(adapt, config=config, check=lambda ids, seen: jnp.ones(len(ids))))
+    assert float(run(small_denoiser(), start, ADAM.init(start), rows, draws, jnp.asarray(1))[2]["pet_spr"]) == 1
+
+
 @pytest.mark.parametrize(("frequency", "updates", "each"), [(10, 80, 8), (5, 80, 4), (100, 80, 80), (0, 80, 0)])
 def test_steps_of_an_iteration(frequency, updates, each):
     totals = [steps_until(i, frequency, updates) for i in range(5)]

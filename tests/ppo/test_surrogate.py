@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import norm
 
 from ppo_dap.nets.actor import log_prob
-from ppo_dap.ppo.surrogate import clipped_surrogate, importance_ratio, normalise, weighted_mean
+from ppo_dap.ppo.surrogate import clipped_surrogate, importance_ratio, normalise, share, weighted_mean
 
 SURROGATE = jax.jit(jax.value_and_grad(lambda *rows: clipped_surrogate(*rows, 0.2)))
 
@@ -75,3 +75,18 @@ def test_weighted_mean_and_normalise_see_only_rows_with_weight():
         normalise(array(*values), array(*weights))[:3], (seen - seen.mean()) / seen.std(), rtol=1e-5
     )
     np.testing.assert_array_equal(normalise(array(3, 3), array(1, 1)), 0)  # no spread: nothing to divide by
+
+
+@pytest.mark.parametrize("rows", [41.0, 47.0, 55.0])
+def test_a_share_of_all_is_exactly_1_however_a_device_divides(rows):
+    whole = jnp.float32(rows)
+
+    def under_jit(function, part):
+        """With the whole a constant, by whose rounded reciprocal XLA multiplies."""
+        return float(jax.jit(lambda part: function(part, whole))(jnp.float32(part)))
+
+    assert under_jit(jnp.divide, rows) == pytest.approx(1)
+    assert under_jit(jnp.divide, rows) != 1  # the planted fault
+    assert [under_jit(share, part) for part in (rows, 0.0)] == [1, 0]
+    assert under_jit(share, rows - 1) == pytest.approx(1 - 1 / rows)
+    assert [float(jax.jit(share)(jnp.float32(part), whole)) for part in (rows, 0.0)] == [1, 0]

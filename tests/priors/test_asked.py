@@ -65,7 +65,7 @@ def test_weight_1_is_the_conditioned_prior_and_weight_0_the_unconditioned_one(so
     network, noise = fresh(), np.random.default_rng(1).standard_normal(plain.noise_shape(1, 20, 1))
     own = network.sample(jnp.zeros((1, 2)), jnp.ones((1, 2)), jnp.asarray(noise, jnp.float32), plain)[0]
     np.testing.assert_allclose(own[0, :, 0], conditioned, atol=1e-5)
-    np.testing.assert_array_equal(sampled(fresh(), 0.0, **options), free)
+    np.testing.assert_allclose(sampled(fresh(), 0.0, **options), free, atol=1e-6)  # a GPU rounds two programs apart
     assert np.abs(conditioned - free).max() > 0.02
     # Between the two, and beyond.
     assert np.abs(sampled(fresh(), 0.5, **options) - conditioned).max() > 1e-3

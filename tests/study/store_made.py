@@ -1,5 +1,6 @@
 """Small grids of stubs, and a supervisor whose workers make these (stub_worker.py)."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -13,6 +14,10 @@ from ppo_dap.study.store import Store
 from ppo_dap.study.supervise import Supervisor
 
 COMMAND = (sys.executable, str(Path(__file__).with_name("stub_worker.py")))
+
+FOLDERS = (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", ""))
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, FOLDERS))}
+"""Of a process that imports these modules."""
 
 
 def base(number=0, **how):

@@ -21,10 +21,13 @@ def test_the_iteration_that_compiles_counts_neither_as_steps_nor_as_time():
 def test_the_table_has_every_figure_of_every_task(capsys):
     figures = {"dap_wall_x_ppo": 1.0625, "steps_per_second": {"ppo": 12_345.0}}
     machine = {"processor": "a processor", "cores": 2, "python": "3.11", "versions": {"jax": "0"}, "seconds": 10.0}
-    print_bench({"tasks": {"A-v5": figures, "B-v5": {**figures}}, "machine": machine, "command": "ppo-dap bench"})
+    made = {"tasks": {"A-v5": figures, "B-v5": {**figures}}, "command": "ppo-dap bench"}
+    print_bench(made | {"machine": machine | {"device": "cpu"}})
     printed = capsys.readouterr().out
-    for part in ("A-v5", "B-v5", "1.062", "12,345", "a processor, 2 cores", "jax 0", "ppo-dap bench"):
+    for part in ("A-v5", "B-v5", "1.062", "12,345", "a processor, 2 cores; Python", "jax 0", "ppo-dap bench"):
         assert part in printed
+    print_bench(made | {"machine": machine | {"device": "a GPU"}})
+    assert "a processor, 2 cores, a GPU; Python" in capsys.readouterr().out
 
 
 def test_the_figure_of_a_sweep_is_drawn(tmp_path):

@@ -17,7 +17,7 @@ from ppo_dap.study.claims import Watch, take
 from ppo_dap.study.plan import Plan
 from ppo_dap.study.store import Store, open_store
 from ppo_dap.study.supervise import Supervisor
-from study.store_made import COMMAND, base, contents, small_grid, study, supervisor, target
+from study.store_made import COMMAND, ENVIRONMENT, base, contents, small_grid, study, supervisor, target
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,8 @@ def test_without_claims_work_is_done_twice(tmp_path, monkeypatch, capsys):
     root, cell = tmp_path / "store", base()
     Store(root).prepare(cell)
     for _ in range(2):
-        subprocess.run([sys.executable, str(script), str(root), cell.name, "1"], check=True, timeout=60)
+        command = [sys.executable, str(script), str(root), cell.name, "1"]
+        subprocess.run(command, check=True, timeout=60, env=ENVIRONMENT)
     assert _made(root) == [2]
 
 
@@ -161,8 +162,9 @@ def test_a_worker_that_was_taken_for_dead_ends_itself(tmp_path):
         "from ppo_dap.study.store import Store; from ppo_dap.study.worker import work\n"
         "sys.exit(work(Store(Path(sys.argv[1])), sys.argv[2], 1, make, 0.05))"
     )
-    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), cell.name])
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), cell.name], env=ENVIRONMENT)
     while Watch().free(store.folder(cell)) == 1:
+        assert process.poll() is None
         time.sleep(0.02)
     assert take(store.folder(cell), 2) is not None
     assert process.wait(30) == 5
@@ -247,9 +249,11 @@ def test_workers_end_with_their_planner_and_another_goes_on(tmp_path, capsys):
         "import sys; from pathlib import Path; from study.store_made import *\n"
         "supervisor(Path(sys.argv[1]), study(base(slow=1.5))).run()"
     )
-    planner = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.DEVNULL)
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    planner = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=ENVIRONMENT)
     store = Store(tmp_path)
     while not (store.out(cell) / "last.safetensors").exists():
+        assert planner.poll() is None
         time.sleep(0.02)
     planner.kill()
     planner.wait()

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from ppo_dap.config import AdaptationConfig
 from ppo_dap.nets.adapters import Adapters, Backbone
+from ppo_dap.ppo.surrogate import share
 from ppo_dap.priors.network import TrainedNetwork
 
 Provenance = Callable[[Int[Array, " n"], Float[Array, "n obs"]], Float[Array, " n"]]
@@ -89,7 +90,8 @@ def adapt(
         )(adapters)
         updates, optimizer = ADAM.update(gradient, optimizer)
         adapters = jax.tree.map(lambda p, u: p - config.pet_learning_rate * u, adapters, updates)
-        spr = jnp.minimum(spr, jnp.mean(check(batch.state_ids, batch.observations)))
+        passed = jnp.sum(check(batch.state_ids, batch.observations))
+        spr = jnp.minimum(spr, share(passed, jnp.float32(config.pet_minibatch_size)))
         return adapters, optimizer, total + loss, spr
 
     carry = (adapters, optimizer, jnp.zeros(()), jnp.ones(()))

@@ -90,7 +90,7 @@ class _Walker:
         if name == "optimization_barrier":
             return inputs
         if name == "scan":
-            return self.scan(params, inputs)
+            return self.scan(eqn, inputs)
         if name == "while":
             return self.while_loop(params, inputs)
         if name == "cond":
@@ -110,12 +110,15 @@ class _Walker:
             return frozenset({name})
         return labels | {name} if name in self.sources else labels
 
-    def scan(self, params: Mapping[str, Any], inputs: list[Labels]) -> list[Labels]:
+    def scan(self, eqn: Any, inputs: list[Labels]) -> list[Labels]:
         """A loop over a leading axis: what reaches the carry once reaches it in every later step."""
-        fixed, count = params["num_consts"], params["num_carry"]
+        body = eqn.params["jaxpr"].jaxpr
+        # Sizes off the shapes, since JAX 0.11 names them differently: what is stacked has one axis more outside.
+        count, scanned = _as_inside(eqn.outvars, body.outvars), len(inputs) - _as_inside(eqn.invars, body.invars)
+        fixed = len(inputs) - count - scanned
         constants, carry, xs = inputs[:fixed], inputs[fixed : fixed + count], inputs[fixed + count :]
         while True:
-            outputs = self.run(params["jaxpr"].jaxpr, [*constants, *carry, *xs])
+            outputs = self.run(body, [*constants, *carry, *xs])
             merged = [a | b for a, b in zip(carry, outputs[:count], strict=True)]
             if merged == carry:
                 return [*merged, *outputs[count:]]
@@ -133,3 +136,8 @@ class _Walker:
             if merged == carry:
                 return merged
             carry = merged
+
+
+def _as_inside(outer: Sequence[Any], inner: Sequence[Any]) -> int:
+    """How many values of a loop have the same number of axes outside it as in its body."""
+    return sum(a.aval.ndim == b.aval.ndim for a, b in zip(outer, inner, strict=True))

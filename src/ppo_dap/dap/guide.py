@@ -21,6 +21,7 @@ from ppo_dap.dap.proposals import ProposalDraws, Proposals, Proposer, States, ch
 from ppo_dap.nets.actor import Actor
 from ppo_dap.nets.adapters import Adapters, Backbone, adapter_norm, init_adapters
 from ppo_dap.nets.critic import Critic, QFunction, q_features
+from ppo_dap.ppo.surrogate import share
 from ppo_dap.ppo.update import Rows
 from ppo_dap.priors.network import Network, TrainedNetwork
 
@@ -190,7 +191,8 @@ def gate_proposals(
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *(part.metrics for part in parts))
     spread = jnp.sqrt(jnp.mean(jnp.stack([jnp.square(part.q_spread) for part in parts])))
     metrics = {name: jnp.mean(values) for name, values in stacked.items()}
-    metrics["spr"] = jnp.sum(gated.gate) / jnp.maximum(sum(part.wanted for part in parts), 1)
+    wanted = jnp.maximum(sum(part.wanted for part in parts), 1).astype(jnp.float32)
+    metrics["spr"] = share(jnp.sum(gated.gate), wanted)
     return gated, Q_SPREAD_DECAY * guide.q_spread + (1 - Q_SPREAD_DECAY) * spread, metrics
 
 

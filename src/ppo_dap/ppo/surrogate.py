@@ -119,6 +119,14 @@ def weighted_mean(values: Float[Array, " n"], weights: Float[Array, " n"]) -> Fl
     return jnp.sum(values * weights) / jnp.maximum(jnp.sum(weights), 1e-8)
 
 
+def share(part: Float[Array, ""], whole: Float[Array, ""]) -> Float[Array, ""]:
+    """part / whole, and exactly 1 where they are the same.
+
+    A GPU's quotient of equal numbers need not be; nor a CPU's by a constant, which XLA makes a product.
+    """
+    return jnp.where(part == whole, 1.0, part / whole)
+
+
 def normalise(advantages: Float[Array, " n"], weights: Float[Array, " n"]) -> Float[Array, " n"]:
     """Advantages to mean 0 and standard deviation 1 over the rows with weight."""
     mean = weighted_mean(advantages, weights)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ppo_dap.errors import PPODAPError
-from ppo_dap.training.manifest import manifest
+from ppo_dap.training.manifest import manifest, prepare_jax
 from ppo_dap.training.recording import read_table
 
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -175,6 +175,7 @@ def bench(tasks: Sequence[str], steps: int, repeats: int, peers: Path | None, sa
     with tempfile.TemporaryDirectory(prefix="ppo-dap-bench-") as folder:
         run = Bench(Path(folder), steps, repeats, peers, say)
         figures = {task: run.task(task) for task in tasks}
+    prepare_jax()  # as the runs had it, and no sooner: the peers are started as their users start them
     about = manifest() | {"processor": processor(), "cores": os.cpu_count(), "seconds": time.perf_counter() - start}
     return {"command": " ".join(["ppo-dap", *sys.argv[1:]]), "machine": about, "tasks": figures}
 
@@ -200,7 +201,8 @@ def print_bench(figures: Mapping[str, Any]) -> None:
     Console(width=None if sys.stdout.isatty() else 100).print(table)
     machine = figures["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items() if version)
-    print(f"{machine['processor']}, {machine['cores']} cores; Python {machine['python']}, {versions}")
+    device = "" if machine["device"] == "cpu" else f", {machine['device']}"
+    print(f"{machine['processor']}, {machine['cores']} cores{device}; Python {machine['python']}, {versions}")
     print(f"{figures['command']}   ({machine['seconds']:,.0f} s)")
 
 

@@ -30,6 +30,7 @@ from ppo_dap.dap.proposals import ProposalDraws, Proposer
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.reuse import Candidate, contest, no_batch, previous_rows, remember
 from ppo_dap.ppo.rollout import Rollout
+from ppo_dap.ppo.surrogate import share
 from ppo_dap.ppo.update import (
     Normaliser,
     PPOState,
@@ -125,7 +126,7 @@ def _advantages(
     rows = estimate_advantages(critic, parts, normaliser, reward_std, config.ppo)
     batch = Batch(first_id, rows.raw_observations, rows.weights)
     admitted = admit(rows, batch)
-    return admitted, batch, {"batch_fresh": jnp.sum(admitted.weights) / jnp.sum(rows.weights)}
+    return admitted, batch, {"batch_fresh": share(jnp.sum(admitted.weights), jnp.sum(rows.weights))}
 
 
 def _contest(
@@ -138,7 +139,7 @@ def _contest(
     gate = provenance(previous.state_ids, previous.raw_observations, batch)
     fresh = jnp.sum(rows.weights) + won * jnp.sum(previous.weights * gate)
     seen = jnp.sum(batch.weights) + won * jnp.sum(previous.weights)
-    return winner._replace(metrics=winner.metrics | metrics | {"batch_fresh": fresh / seen})
+    return winner._replace(metrics=winner.metrics | metrics | {"batch_fresh": share(fresh, seen)})
 
 
 def _propose(

@@ -1,4 +1,4 @@
-"""What a run's numbers depend on besides its config: versions, processor, core setting."""
+"""What a run's numbers depend on besides its config: versions, processor, device, core setting."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PACKAGES = ("ppo-dap", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium"
 
 
 def prepare_jax() -> None:
-    """Set, before JAX is imported, what the user's environment does not: one core, and a cache of compiled programs.
+    """Set, before JAX is imported, what the user's environment does not: a core, a cache of programs, float32.
 
     JAX's results on a CPU change with the number of cores that it sees, so `NPROC` is 1 unless set.
     """
@@ -22,12 +22,18 @@ def prepare_jax() -> None:
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+    # A GPU's products would be of 10 bits (TF32), while the policy that collects, in numpy, computes with all 23.
+    os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+    # The networks are small, and a study's runs share the GPU: the first would take three quarters of its memory.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # JAX does not write an entry in one step: one that another process is at, or was killed at, is compiled anew.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
 
 
 def manifest() -> dict[str, Any]:
-    """Versions, processor flags that change floating-point results, and `NPROC`."""
+    """Versions, device, the precision of products, processor flags that change floating-point results, and `NPROC`."""
+    import jax
+
     versions = {}
     for package in PACKAGES:
         try:
@@ -38,6 +44,8 @@ def manifest() -> dict[str, Any]:
         "versions": versions,
         "python": platform.python_version(),
         "machine": platform.machine(),
+        "device": jax.devices()[0].device_kind,
+        "matmul_precision": jax.config.jax_default_matmul_precision,
         "cpu_flags": _cpu_flags(),
         "NPROC": os.environ.get("NPROC"),
     }
