@@ -150,8 +150,9 @@ class Shown(NamedTuple):
     title: str
     cells: list[list[str]]
     """A row a task and method, under `COLUMNS`."""
-    notes: list[str]
-    """What holds over the tasks, and the runs that are in no pair."""
+    over_tasks: list[str]
+    unpaired: list[str]
+    """The runs that are in no pair."""
 
 
 def shown(rows: Sequence[Row], over_tasks: Sequence[Row] = (), epochs: float = 40.0) -> list[Shown]:
@@ -159,8 +160,8 @@ def shown(rows: Sequence[Row], over_tasks: Sequence[Row] = (), epochs: float = 4
     found = []
     for metric in dict.fromkeys(row["metric"] for row in rows):
         own = [row for row in rows if row["metric"] == metric]
-        notes = [*_over_tasks(over_tasks, metric), *_left_out(own)]
-        found.append(Shown(_title(own[0], epochs), [_cells(row) for row in own], notes))
+        cells = [_cells(row) for row in own]
+        found.append(Shown(_title(own[0], epochs), cells, _over_tasks(over_tasks, metric), _left_out(own)))
     return found
 
 
@@ -183,7 +184,7 @@ def print_comparison(rows: Sequence[Row], over_tasks: Sequence[Row] = (), epochs
             table.add_section()
         console = Console(width=120)
         console.print(table)
-        for note in part.notes:
+        for note in (*part.over_tasks, *part.unpaired):
             console.print(note, markup=False, highlight=False)
 
 
@@ -194,7 +195,8 @@ def markdown(rows: Sequence[Row], over_tasks: Sequence[Row] = (), epochs: float 
         cells = ([cell.replace("|", r"\|") for cell in line] for line in part.cells)
         lines = [COLUMNS, ["---"] * 2 + ["---:"] * (len(COLUMNS) - 2), *cells]
         parts += [part.title, "\n".join(f"| {' | '.join(line)} |" for line in lines)]
-        parts += ["\n".join(f"- {note}" for note in part.notes)] if part.notes else []
+        notes = [f"- {note}" for note in (*part.over_tasks, *part.unpaired)]
+        parts += ["\n".join(notes)] if notes else []
     return "\n\n".join(parts)
 
 

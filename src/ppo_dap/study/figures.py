@@ -44,7 +44,14 @@ def learning_curves(groups: Mapping[str, Sequence[Run]], path: Path, title: str)
         for rows in evaluations:
             axes.plot(*_curve(rows) / [[1e3], [1]], color=colour, linestyle=dash, linewidth=0.8, alpha=0.5)
         steps, returns = on_common_steps(evaluations)
-        axes.plot(steps / 1e3, returns.mean(0), color=colour, linestyle=dash, linewidth=2.4, label=f"{label} (n = {len(runs)})")
+        axes.plot(
+            steps / 1e3,
+            returns.mean(0),
+            color=colour,
+            linestyle=dash,
+            linewidth=2.4,
+            label=f"{label} (n = {len(runs)})",
+        )
     axes.set(xlabel="environment steps (thousands)", ylabel="return of the deterministic policy", title=title)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
