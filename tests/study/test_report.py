@@ -274,7 +274,7 @@ def test_runs_that_cannot_be_told_apart(tmp_path):
     page = written([*folders, again], tmp_path / "a.html", baseline="ppo + learning_rate=0.001")
     assert {line["method"]: line["seeds"] for line in page.table("seeds")}["ppo + learning_rate=0.002"] == "0-5, 6 x2"
     assert f"cannot be paired: {folders[13]}, {again}." in page.words()
-    assert "1 group of runs share method" in page.words()
+    assert "In 1 case runs share method" in page.words()
     assert {line["pairs"] for line in page.table("pairs")} == {"-", "6"}
 
 
@@ -403,6 +403,8 @@ def test_hostile_names_are_text(tmp_path):
     shown = [data for tag, data in page.texts if HOSTILE in data and tag != "script"]
     assert len(shown) > 10
     data = page.data()
+    (block,) = (text for tag, text in page.texts if tag == "script" and text.startswith("{"))
+    assert not set("<>&") & set(block)  # neither an end tag nor the start of a comment
     assert data["runs"][0]["label"] == f"ppo + guidance={HOSTILE}"
     assert data["runs"][0]["run"] == str(folder)
 

@@ -219,7 +219,7 @@ def _warnings(found: Found) -> list[Html]:
     twice = doubled(finished(found.entries))
     if twice:
         told.append(
-            f"{parts.counted(len(twice), 'group')} of runs share method, task, steps and seed (x2 beside their seeds). "
+            f"In {parts.counted(len(twice), 'case')} runs share method, task, steps and seed (x2 beside the seeds). "
             "Means and intervals take them for runs of different seeds; pairs leave them out."
         )
     return [tag("p", text, class_="warning") for text in told]
