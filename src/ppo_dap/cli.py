@@ -178,6 +178,7 @@ def _about_runs(command: Command) -> None:
     sub.add_argument("--csv", metavar="FILE", help="write the rows to a .csv as well")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
+    _report_options(command)
     sub = command("study", studies.study, "the paper's tables and figures: run what is missing of their runs")
     studies.study_options(sub)
 
@@ -185,6 +186,25 @@ def _about_runs(command: Command) -> None:
     _collect_options(command)
     sub = command("methods", runs.methods, "the methods and what each of them uses (Table 3)")
     sub.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _report_options(command: Command) -> None:
+    sub = command("report", runs.report, "runs as one html page: who leads, curves, cost, audits, what differs, CSV")
+    sub.add_argument("folders", nargs="+", metavar="RUN", help="run folders; unfinished and damaged ones are named")
+    sub.add_argument("--out", default="report.html", metavar="FILE", help=".html to write (default: %(default)s)")
+    sub.add_argument(
+        "--epochs", type=positive_number, default=40.0, help="T of ALC@T, in 5k steps (default: %(default)s)"
+    )
+    text = "baseline of the comparison, named as `ppo-dap summary --compare` names it (default: ppo, if a run is)"
+    sub.add_argument("--compare", metavar="METHOD", help=text)
+    text = "films in the run folders go into the page up to this many MB together, the others are linked (default: 10)"
+    sub.add_argument("--embed-mb", type=number_of_0_or_more, default=10.0, metavar="MB", help=text)
+    sub.epilog = (
+        "The page is one file that needs no network: send it, or open it from the disk. For example: "
+        "`ppo-dap report runs/* --out report.html`, or, for runs of 50,000 steps, `ppo-dap report runs/ppo-* "
+        "runs/dap-* --compare ppo --epochs 10`. Its curves zoom by dragging and go back by a double click. "
+        "Exit code 1: a run is not what its method declares."
+    )
 
 
 def _diagnostics(command: Command) -> None:

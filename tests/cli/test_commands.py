@@ -27,6 +27,7 @@ COMMANDS = (
     "bound",
     "methods",
     "reliability",
+    "report",
     "study",
 )
 

@@ -6,13 +6,14 @@ import argparse
 import dataclasses
 import functools
 import json
-import math
+import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from ppo_dap.errors import InputError
+from ppo_dap.storage import without_nan
 from ppo_dap.training.manifest import prepare_jax
 
 
@@ -105,7 +106,7 @@ def bound(options: argparse.Namespace) -> int:
 def _diagnosed(found: Any, as_json: bool, show: Callable, png: Path | None, draw: Callable) -> int:
     """A diagnosis in words or JSON, and its figure where one is asked for."""
     if as_json:
-        print(json.dumps(_without_nan(found.report)))
+        print(json.dumps(without_nan(found.report)))
     else:
         show(found.report)
     if png is not None:
@@ -129,7 +130,7 @@ def summary(options: argparse.Namespace) -> int:
         finished = comparable(rows, options.compare)
         shown, over_tasks = compare(finished, options.compare), overall(finished, options.compare)
     if options.json and options.compare is not None:
-        print(json.dumps(_without_nan({"tasks": shown, "overall": over_tasks})))
+        print(json.dumps(without_nan({"tasks": shown, "overall": over_tasks})))
     elif options.json:
         print(json.dumps(rows))
     elif options.markdown:
@@ -141,6 +142,23 @@ def summary(options: argparse.Namespace) -> int:
     if options.csv is not None:
         save_csv(shown, options.csv)
     return 0 if fair else 1
+
+
+def report(options: argparse.Namespace) -> int:
+    """A page of runs; exit code 1 on a violation that a method does not declare."""
+    from ppo_dap.study.report import write_report
+
+    command = ["ppo-dap", "report", *options.folders, "--out", options.out, "--epochs", f"{options.epochs:g}"]
+    command += [] if options.compare is None else ["--compare", options.compare]
+    command += ["--embed-mb", f"{options.embed_mb:g}"]
+    settings = options.epochs, options.compare, options.embed_mb
+    done = write_report(options.folders, options.out, *settings, command=shlex.join(command))
+    left = {"not finished": done.unfinished, "unreadable": done.unreadable}
+    named = ", ".join(f"{count} {what}" for what, count in left.items() if count)
+    print(
+        f"{options.out}: {done.runs} run{'s' * (done.runs != 1)}" + (f" ({named}: named on the page)" if named else "")
+    )
+    return 0 if done.fair else 1
 
 
 def methods(options: argparse.Namespace) -> int:
@@ -160,12 +178,3 @@ def methods(options: argparse.Namespace) -> int:
     print("also known as: " + ", ".join(f"{alias} = {name}" for alias, name in ALIASES.items()))
     print("reconstruction: the paper names the method, and no description of it can be read; see docs/methods.md")
     return 0
-
-
-def _without_nan(value: Any) -> Any:
-    """`value` with None for every number that is none: JSON has no NaN."""
-    if isinstance(value, Mapping):
-        return {name: _without_nan(part) for name, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -7,7 +7,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -144,40 +144,59 @@ def _row(
     }
 
 
+class Shown(NamedTuple):
+    """The comparison of one metric in words."""
+
+    title: str
+    cells: list[list[str]]
+    """A row a task and method, under `COLUMNS`."""
+    over_tasks: list[str]
+    unpaired: list[str]
+    """The runs that are in no pair."""
+
+
+def shown(rows: Sequence[Row], over_tasks: Sequence[Row] = (), epochs: float = 40.0) -> list[Shown]:
+    """The rows of `compare` and of `overall` in words, a table a metric."""
+    found = []
+    for metric in dict.fromkeys(row["metric"] for row in rows):
+        own = [row for row in rows if row["metric"] == metric]
+        cells = [_cells(row) for row in own]
+        found.append(Shown(_title(own[0], epochs), cells, _over_tasks(over_tasks, metric), _left_out(own)))
+    return found
+
+
 def print_comparison(rows: Sequence[Row], over_tasks: Sequence[Row] = (), epochs: float = 40.0) -> None:
     """The rows of `compare` as a table a metric, below it those of `overall` and the runs that are in no pair."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    for metric in dict.fromkeys(row["metric"] for row in rows):
-        own = [row for row in rows if row["metric"] == metric]
-        table = Table(title=_title(own[0], epochs))
+    for part in shown(rows, over_tasks, epochs):
+        table = Table(title=part.title)
         for column in COLUMNS[1:]:
             words = column == "method"
             table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
-        for task in dict.fromkeys(row["task"] for row in own):
+        for task in dict.fromkeys(line[0] for line in part.cells):
             table.add_row(f"[bold]{task}[/bold]")
-            for row in own:
-                if row["task"] == task:
-                    table.add_row(*map(escape, _cells(row)[1:]))
+            for line in part.cells:
+                if line[0] == task:
+                    table.add_row(*map(escape, line[1:]))
             table.add_section()
         console = Console(width=120)
         console.print(table)
-        for line in (*_over_tasks(over_tasks, metric), *_left_out(own)):
-            console.print(line, markup=False, highlight=False)
+        for note in (*part.over_tasks, *part.unpaired):
+            console.print(note, markup=False, highlight=False)
 
 
 def markdown(rows: Sequence[Row], over_tasks: Sequence[Row] = (), epochs: float = 40.0) -> str:
     """What `print_comparison` prints, as Markdown."""
     parts: list[str] = []
-    for metric in dict.fromkeys(row["metric"] for row in rows):
-        own = [row for row in rows if row["metric"] == metric]
-        cells = ([cell.replace("|", r"\|") for cell in _cells(row)] for row in own)
+    for part in shown(rows, over_tasks, epochs):
+        cells = ([cell.replace("|", r"\|") for cell in line] for line in part.cells)
         lines = [COLUMNS, ["---"] * 2 + ["---:"] * (len(COLUMNS) - 2), *cells]
-        parts += [_title(own[0], epochs), "\n".join(f"| {' | '.join(line)} |" for line in lines)]
-        notes = [*_over_tasks(over_tasks, metric), *_left_out(own)]
-        parts += ["\n".join(f"- {note}" for note in notes)] if notes else []
+        parts += [part.title, "\n".join(f"| {' | '.join(line)} |" for line in lines)]
+        notes = [f"- {note}" for note in (*part.over_tasks, *part.unpaired)]
+        parts += ["\n".join(notes)] if notes else []
     return "\n\n".join(parts)
 
 
@@ -202,10 +221,14 @@ def _cells(row: Row) -> list[str]:
     count = f"{row['pairs']}" if row["pairs"] else "-"
     p = (_number(row[name], ".2g") for name in ("p", "smallest_p", "p_holm"))
     change = _with_interval(row, "change", "+.0%")
-    mean = f"{row['mean']:{_digits(row['mean'])}}"
-    if not math.isnan(row["half_width"]):
-        mean += f" +- {row['half_width']:{_digits(row['mean'])}}"
+    mean = mean_text(row["mean"], row["half_width"])
     return [row["task"], row["method"], str(row["n"]), mean, count, change, _number(row["improvement"], ".2f"), *p]
+
+
+def mean_text(mean: float, half_width: float) -> str:
+    """A mean and the half-width of its interval, without it where it is NaN."""
+    text = f"{mean:{_digits(mean)}}"
+    return text if math.isnan(half_width) else f"{text} +- {half_width:{_digits(mean)}}"
 
 
 def _digits(value: float) -> str:

@@ -23,7 +23,11 @@ AUDIT = {(True, True): "strictly on-policy", (False, True): "not, as declared", 
 
 def summarise(runs: Sequence[Run], epochs: float = 40) -> list[dict[str, Any]]:
     """A row a run; `x_ppo` and `wall_x_ppo` compare it with the plain PPO run of the same task, seed and steps."""
-    rows = [_row(run, epochs) for run in runs]
+    return beside_ppo([run_row(run, epochs) for run in runs])
+
+
+def beside_ppo(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of `run_row`, each with `x_ppo` and `wall_x_ppo` added."""
     base = {_pair(row): row for row in rows if row["method"] == "ppo"}
     for row in rows:
         ppo = base.get(_pair(row))
@@ -36,7 +40,8 @@ def _pair(row: dict[str, Any]) -> tuple:
     return row["task"], row["seed"], row["steps"]
 
 
-def _row(run: Run, epochs: float) -> dict[str, Any]:
+def run_row(run: Run, epochs: float = 40) -> dict[str, Any]:
+    """What `summarise` says of one run without its PPO; `alc` is None for a run that ends before `epochs`."""
     evaluations, config = run.evaluations, run.config["config"]
     strictly, declared = run.verdict()
     reached = bool(evaluations) and evaluations[-1]["env_steps"] >= epochs * EPOCH
@@ -78,33 +83,39 @@ def label(stored: Mapping[str, Any]) -> str:
     return name + "".join(f" + {key}={value}" for key, value in differ.items())
 
 
+def columns(epochs: float) -> list[str]:
+    """Heads of the `cells`."""
+    return ["task", "seed", "method", f"ALC@{epochs:g}", "x PPO", "last return", "training", "x PPO", "audit"]
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """A row of `summarise` in words, under `columns`."""
+
+    def number(value: float | None, digits: int) -> str:
+        return "-" if value is None else f"{value:,.{digits}f}"
+
+    plain = row["preset"] == "paper" or row["method"] == "ppo"
+    return [
+        row["task"],
+        str(row["seed"]),
+        row["method"] if plain else f"{row['method']} ({row['preset']})",
+        number(row["alc"], 0),
+        number(row["x_ppo"], 2),
+        number(row["last_return"], 0),
+        number(row["seconds"], 0) + " s",
+        number(row["wall_x_ppo"], 2),
+        AUDIT[row["audit"], row["declared"]],
+    ]
+
+
 def print_summary(rows: Sequence[dict[str, Any]], epochs: float, title: str | None = None) -> None:
     """The rows as a table."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title=title)
-    for column in ("task", "seed", "method", f"ALC@{epochs:g}", "x PPO", "last return", "training", "x PPO", "audit"):
+    for column in columns(epochs):
         table.add_column(column, justify="left" if column in ("task", "method", "audit") else "right", no_wrap=True)
-
-    def number(value: float | None, digits: int) -> str:
-        return "-" if value is None else f"{value:,.{digits}f}"
-
     for row in rows:
-        method = (
-            row["method"]
-            if row["preset"] == "paper" or row["method"] == "ppo"
-            else f"{row['method']} ({row['preset']})"
-        )
-        table.add_row(
-            row["task"],
-            str(row["seed"]),
-            method,
-            number(row["alc"], 0),
-            number(row["x_ppo"], 2),
-            number(row["last_return"], 0),
-            number(row["seconds"], 0) + " s",
-            number(row["wall_x_ppo"], 2),
-            AUDIT[row["audit"], row["declared"]],
-        )
+        table.add_row(*cells(row))
     Console(width=120).print(table)
