@@ -54,6 +54,8 @@ def test_figures_of_a_task_against_scipy():
         assert of["p"] == pytest.approx(stats.wilcoxon(x, y, method="exact").pvalue)
         assert of["improvement"] == pytest.approx(stats.mannwhitneyu(x, y).statistic / 25)
         assert of["effect"] == pytest.approx(stats.ttest_rel(x, y).statistic / math.sqrt(5))
+        low, high = stats.ttest_rel(x, y).confidence_interval()
+        assert (of["difference"], of["difference_half_width"]) == pytest.approx(((low + high) / 2, (high - low) / 2))
         assert of["change"] == pytest.approx((x.mean() - y.mean()) / abs(y.mean()))
         assert of["change_low"] < of["change"] < of["change_high"]
     assert found["Hopper-v5", "dap"]["ratio"] == pytest.approx(1 + found["Hopper-v5", "dap"]["change"])

@@ -35,8 +35,8 @@ def store(tmp_path):
     rows = [
         _metrics(0, ess=None),
         _metrics(1, ess=2.0),
-        _metrics(2, spr=0.5, oglr=0.25, batch_fresh=0.5),
-        _metrics(3, ess=math.nan),
+        _metrics(2, spr=0.5, oglr=0.25, batch_fresh=0.5, pgshare=0.5),
+        _metrics(3, ess=math.nan, pgshare=1.0),
     ]
     (out / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (out / "evaluations.jsonl").write_text("".join(json.dumps(row) + "\n" for row in EVALUATIONS))
@@ -56,7 +56,8 @@ def test_figures_of_a_run_are_those_of_its_tables(store):
     # Two iterations after those that compile, of 1 s of environments and 2 s in all.
     assert (row["env_steps"], row["seconds_env"], row["seconds_iteration"]) == (4000, 2.0, 4.0)
     assert row["ess"] == 3.0  # of 2 and 4: None and NaN are no values
-    assert (row["spr"], row["oglr"], row["batch_fresh"], row["pgshare"]) == (0.5, 0.25, 0.5, None)
+    assert (row["spr"], row["oglr"], row["batch_fresh"], row["pgshare"]) == (0.5, 0.25, 0.5, 0.5)
+    assert row["pgshare_mean"] == 0.75
     assert (row["seconds"], row["peak_mib"]) == (12.5, 100.0)
     # A claim is violated, by the third iteration, and the method does not declare it.
     assert (row["strictly_on_policy"], row["as_declared"]) == (False, False)

@@ -124,6 +124,18 @@ def test_a_bootstrap_is_its_seed():
     assert made(seed=1) != made(seed=2)
 
 
+def test_resamples_at_once_are_those_one_by_one():
+    """Two strata, two columns that stay together."""
+    scores = {"a": draws(4, 2), "b": draws(5, 2, seed=1)}
+
+    def product(scores, axis=0):
+        return sum((rows[..., 0] * rows[..., 1]).mean(axis) for rows in scores.values())
+
+    found = stratified_bootstrap(scores, partial(product, axis=-1), 300, at_once=True)
+    assert found == pytest.approx(stratified_bootstrap(scores, product, 300))
+    assert found.low < found.value < found.high
+
+
 def test_one_run_of_a_task_has_no_bootstrap_interval():
     found = stratified_bootstrap({"a": draws(5), "b": draws(1)}, over_tasks)
     assert np.isnan(found).tolist() == [False, True, True]

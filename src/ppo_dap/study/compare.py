@@ -15,7 +15,7 @@ from ppo_dap.errors import InputError, unknown
 from ppo_dap.study.pairing import Pairs, cohens_d_paired, holm, paired, paired_wilcoxon, smallest_p
 from ppo_dap.study.statistics import (
     REPS,
-    interquartile_mean,
+    interquartile_means,
     mean_interval,
     normalised_score,
     normalised_tasks,
@@ -37,8 +37,9 @@ def compare(
     `n`, `mean` and `half_width` (Student's t, 95%) are over all finished runs that have the metric. Everything else is
     over the `pairs` with the baseline (task, seed and steps agree): `ratio` of the means where the baseline's is above
     0, `change` over its absolute value with its interval, `effect` (d_z), exact Wilcoxon `p` beside the `smallest_p`
-    that so many pairs can give, `p_holm` over the tasks of this method and metric, and `improvement`, the probability
-    that a run of the method beats one of the baseline, with its interval. `unpaired` names the runs in no pair.
+    that so many pairs can give, `p_holm` over the tasks of this method and metric, `improvement`, the probability that
+    a run of the method beats one of the baseline, with its interval, and `difference`, the mean of the paired
+    differences, with `difference_half_width` (Student's t, 95%). `unpaired` names the runs in no pair.
 
     `reps` is the number of resamples. A run that is not finished is left out with a warning. Raises `InputError` for a
     baseline that no run has, and for runs of several budgets on one task.
@@ -82,7 +83,8 @@ def overall(
             row["normalised_tasks"] = len(normalised)
             for name, side in (("iqm", x), ("iqm_baseline", y)):
                 scores = {t: np.array([normalised_score(t, value) for value in side[t]]) for t in normalised}
-                row |= _named(name, stratified_bootstrap(scores, _iqm, reps) if scores else (math.nan,) * 3)
+                told = stratified_bootstrap(scores, _iqm, reps, at_once=True) if scores else (math.nan,) * 3
+                row |= _named(name, told)
             found.append(row)
     return found
 
@@ -113,8 +115,8 @@ def _named(name: str, interval: Sequence[float]) -> dict[str, float]:
     return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
 
 
-def _iqm(scores: Mapping[str, Any]) -> float:
-    return interquartile_mean(np.concatenate(list(scores.values())))
+def _iqm(scores: Mapping[str, Any]) -> Any:
+    return interquartile_means(np.concatenate(list(scores.values()), axis=-1))
 
 
 def _row(
@@ -125,7 +127,7 @@ def _row(
     row: dict[str, Any] = {"task": task, "method": method, "baseline": baseline, "metric": metric, "n": len(own)}
     row |= {"mean": mean, "half_width": half_width, "pairs": 0, "unpaired": []}
     row |= dict.fromkeys(("ratio", "change", "change_low", "change_high", "effect"), math.nan)
-    row |= dict.fromkeys(("p", "smallest_p", "p_holm"), math.nan)
+    row |= dict.fromkeys(("difference", "difference_half_width", "p", "smallest_p", "p_holm"), math.nan)
     row |= _named("improvement", (math.nan,) * 3)
     if method == baseline:
         return row
@@ -135,6 +137,7 @@ def _row(
     x, y = pairs.values[task].T
     return row | {
         "pairs": len(x),
+        **dict(zip(("difference", "difference_half_width"), mean_interval(x - y), strict=True)),
         "ratio": float(x.mean() / y.mean()) if y.mean() > 0 else math.nan,
         **_named("change", relative_change(x, y, reps)),
         "effect": cohens_d_paired(x, y),

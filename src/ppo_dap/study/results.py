@@ -138,6 +138,8 @@ def _measured(run: Run) -> Row:
     for name in MEANS:
         values = [row[name] for row in metrics if _number(row.get(name))]
         found[name] = sum(values) / len(values) if values else None
+    shares = [row["pgshare"] for row in metrics if _number(row.get("pgshare"))]
+    found["pgshare_mean"] = sum(shares) / len(shares) if shares else None  # the paper tells its usual size (5.8)
     for name, worst in WORST.items():
         values = [row[name] for row in metrics if _number(row.get(name))]
         found[name] = worst(values) if values else None
