@@ -19,6 +19,7 @@ from ppo_dap.errors import InputError
 from ppo_dap.priors.diffusion import Denoiser, DiffusionConfig
 from ppo_dap.priors.prior import Prior
 from ppo_dap.study.guided_run import load_guided
+from ppo_dap.study.proposal_figure import high_q_shares, proposals_of
 from ppo_dap.study.reliability_report import (
     FALLBACK,
     Pairs,
@@ -95,6 +96,20 @@ def test_candidates_belong_to_their_states_and_guidance_raises_their_q(guided, o
     moved = np.abs(guided.candidates(far, False, seed=0) - free).max((1, 2))
     assert moved.argmax() == 2
     assert np.delete(moved, 2).max() < 1e-4 < moved[2]
+
+
+def test_proposals_of_a_run_are_taken_at_states_that_it_visits(made):
+    rows = proposals_of(made / "run", made / "prior", states=6)
+    assert [row["state"] for row in rows] == [i for i in range(6) for _ in range(2 * SMALL["num_proposals"])]
+    for state in range(6):
+        own = [row for row in rows if row["state"] == state]
+        assert [sum(row["drawn"] for row in own if row["guided"] == kind) for kind in (0, 1)] == [5, 5]
+        assert sum(row["q"] for row in own) == pytest.approx(0, abs=1e-2)
+    shares = high_q_shares(rows)
+    assert shares["no guidance"] == pytest.approx(0.2)  # one of five, as all differ
+    assert shares["energy + gradient"] > shares["no guidance"]
+    with pytest.raises(InputError, match="states 1 must be at least 2"):
+        proposals_of(made / "run", made / "prior", states=1)
 
 
 def test_energy_weights_are_eq_7s_with_the_runs_numbers(guided):

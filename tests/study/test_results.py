@@ -85,6 +85,7 @@ def test_files_hold_what_was_gathered(store, tmp_path):
     found.runs["1234567890123456"] = found.runs[done.name] | {"options": "1"}
     found.curves["1234567890123456"] = found.curves[done.name]
     found.reports["12e4567890123456"] = {"of": done.name, "within.rho": -0.25, "states": 4, "fallback": None}
+    found.proposals[done.name] = [{"state": 0, "guided": g, "drawn": 2, "q": -0.5, "x": 1.25, "y": 3.0} for g in (0, 1)]
     found.save(tmp_path / "results")
     again = load_results(tmp_path / "results")
     assert again == found

@@ -11,6 +11,7 @@ from ppo_dap.errors import InputError
 from ppo_dap.study.statistics import (
     interquartile_mean,
     mean_interval,
+    mean_relative_change,
     normalised_score,
     normalised_tasks,
     probability_of_improvement,
@@ -175,6 +176,14 @@ def test_relative_change_resamples_pairs():
     assert relative_change(1.5 * y, y) == pytest.approx((0.5, 0.5, 0.5))
     apart = stratified_bootstrap({"x": 1.5 * y, "y": y}, lambda s: s["x"].mean() / s["y"].mean() - 1)
     assert apart.high - apart.low > 0.1
+
+
+def test_mean_relative_change_weighs_tasks_alike_and_resamples_within_them():
+    """+50% on three pairs, -25% on one task of two pairs whose returns are a hundred times as large."""
+    y = draws(3) + 10
+    pairs = {"small": np.stack([1.5 * y, y], 1), "large": np.array([[-1250.0, -1000], [-2500, -2000]])}
+    assert mean_relative_change(pairs) == pytest.approx((0.125, 0.125, 0.125))
+    assert np.isnan(mean_relative_change(pairs | {"none": np.array([[1.0, 0.0], [2.0, 0.0]])})).all()
 
 
 def test_relative_change_from_nothing_is_not_told():

@@ -3,6 +3,7 @@
 runs.csv         a row a run: what it was, what it cost, what its audit and its proposals measured
 evaluations.csv  a row an evaluation: cell, env_steps, return_mean, length_mean
 reports.csv      a row a reliability report (5.7)
+proposals.csv    a row a candidate of the few runs that Fig. 11 shows (proposal_figure.py)
 
 Rows are named by their cell, so studies share them; labels come from the studies themselves.
 """
@@ -47,6 +48,8 @@ class Results:
     curves: dict[str, list[Row]] = field(default_factory=dict)
     """Evaluations: rows of env_steps, return_mean, length_mean."""
     reports: dict[str, Row] = field(default_factory=dict)
+    proposals: dict[str, list[Row]] = field(default_factory=dict)
+    """Candidates of a run: rows of state, guided, drawn, q, x, y."""
 
     def rows(self, study: Study, **wanted: Any) -> list[Row]:
         """A row for each entry of the study that is a finished run and has these labels.
@@ -66,11 +69,15 @@ class Results:
         return found
 
     def save(self, folder: Path) -> None:
-        """Write the three files; rows are in the order of their cells' names, so that a file changes where runs do."""
+        """Write the files; rows are in the order of their cells' names, so that a file changes where runs do."""
         for name, rows in (
             ("runs.csv", [{"cell": cell} | self.runs[cell] for cell in sorted(self.runs)]),
             ("evaluations.csv", [{"cell": cell} | row for cell in sorted(self.curves) for row in self.curves[cell]]),
             ("reports.csv", [{"cell": cell} | self.reports[cell] for cell in sorted(self.reports)]),
+            (
+                "proposals.csv",
+                [{"cell": c} | row for c in sorted(self.proposals) for row in self.proposals[c]],
+            ),
         ):
             if rows:
                 write_atomically(folder / name, _csv(rows).encode())
@@ -85,6 +92,8 @@ def load_results(folder: Path) -> Results:
         found.curves.setdefault(row.pop("cell"), []).append(row)
     for row in _read(folder / "reports.csv"):
         found.reports[row.pop("cell")] = row
+    for row in _read(folder / "proposals.csv"):
+        found.proposals.setdefault(row.pop("cell"), []).append(row)
     lacking = found.runs.keys() ^ found.curves.keys()
     if lacking:
         raise InputError(f"{folder}: runs.csv and evaluations.csv must name the same cells; one lacks {min(lacking)}")

@@ -182,8 +182,20 @@ def relative_change(x: Values, y: Values, reps: int = REPS, seed: int = 0, level
     `x` and `y` are matched run by run. Over |mean y|, more is better for negative returns too; where mean y is 0, or
     could be in a resample, it is NaN. Raises `InputError` if they differ in length.
     """
-    pairs = {"": matched(x, y)}
-    return stratified_bootstrap(pairs, lambda scores: _change(scores[""]), reps, seed, level, at_once=True)
+    return mean_relative_change({"": matched(x, y)}, reps, seed, level)
+
+
+def mean_relative_change(
+    pairs: Mapping[str, Float[np.ndarray, "_ 2"]], reps: int = REPS, seed: int = 0, level: float = 0.95
+) -> Interval:
+    """`relative_change` in each task, of columns of matched runs, and its mean over the tasks; pairs are resampled
+    within their task.
+    """
+
+    def over_tasks(scores: Mapping[Any, Any]) -> float:
+        return sum(map(_change, scores.values())) / len(scores)
+
+    return stratified_bootstrap(pairs, over_tasks, reps, seed, level, at_once=True)
 
 
 def _change(pairs: Float[np.ndarray, "... n 2"]) -> Any:
