@@ -1,6 +1,5 @@
 """Figures of studies: what stands in them is read back, and compared with what was worked out by hand."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -15,9 +14,9 @@ from ppo_dap.study.drawing import MAIN, looks
 from ppo_dap.study.figure_data import BANDED, band, changes, mean_over_tasks, of_runs, pareto
 from ppo_dap.study.figure_panels import BOXED
 from ppo_dap.study.grids import Scale
-from ppo_dap.study.paper_figures import DRAWINGS, FIGURES, draw, figures_of
+from ppo_dap.study.paper_figures import DRAWINGS, FIGURES, figures_of
 from ppo_dap.study.results import Results
-from ppo_dap.study.studies import SMOKE, STUDIES, make_study, only
+from ppo_dap.study.studies import SMOKE, STUDIES, make_study, only, parts
 from study.levels_made import made_results
 
 REPS = 8
@@ -305,7 +304,7 @@ def test_mitigations_stand_below_the_levels_of_coverage():
 
 def test_parts_are_compared_with_the_whole_on_the_same_seeds():
     study, results, found = drawn("mixed", seeds=(0, 1, 2, 3))
-    rows = results.rows(study)
+    rows = results.rows(study, part="early")
     axes = found["mixed-parts"].axes[1]
     assert axes.get_title() == "Hopper: ALC@40"
     names = [text.get_text() for text in found["mixed-parts"].axes[0].get_yticklabels()]
@@ -329,7 +328,7 @@ def test_methods_on_mixed_logs_say_which_are_reconstructions():
     assert {"ABPPO (reconstruction)", "PPO-ARC (reconstruction)", "PPO-GC (reconstruction)"} < set(names)
     assert "VAE + PPO (ctrl)" not in names
     assert "VAE + PPO (ctrl)" in found["mixed-methods"].get_suptitle().replace("\n", " ")
-    values = columns(results.rows(study), "PPO + BC", "alc", "Walker2d-v5")
+    values = columns(results.rows(study, part="early"), "PPO + BC", "alc", "Walker2d-v5")
     place = names.index("PPO + BC")
     assert line(axes, "mean").get_xdata()[place] == pytest.approx(values.mean())
     ends = [path.vertices[:, 0] for path in axes.collections[0].get_paths()]
@@ -436,14 +435,20 @@ def smoke():
 
 def test_every_figure_is_written_twice_to_the_same_bytes_in_both_formats(smoke, tmp_path):
     study, results = smoke
-    paths = draw(results, study, tmp_path / "one")
+    paths = [
+        path
+        for part in parts(study)
+        if part.name in FIGURES
+        for path in FIGURES[part.name](results, part, tmp_path / "one")
+    ]
     names = {path.name for path in paths}
     assert {path.name for path in (tmp_path / "one").iterdir()} == names
     files = {"mixed-methods", "mixed-parts", "ablation-alc", "ablation-final"} | DRAWINGS.keys() - {"mixed", "ablation"}
     assert names == {f"{name}.{suffix}" for name in files for suffix in ("svg", "png")}
-    part = dataclasses.replace(study, entries=tuple(e for e in study.entries if e.labels["study"] in ("fig6", "fig11")))
-    for path in draw(results, part, tmp_path / "two"):
-        assert path.read_bytes() == (tmp_path / "one" / path.name).read_bytes()
+    for part in parts(study):
+        if part.name in ("fig6", "fig11"):
+            for path in FIGURES[part.name](results, part, tmp_path / "two"):
+                assert path.read_bytes() == (tmp_path / "one" / path.name).read_bytes()
     for path in paths:
         if path.suffix == ".png":  # nothing reaches the edge, where it would be cut off
             pixels = imread(path)

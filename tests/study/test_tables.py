@@ -481,7 +481,7 @@ def test_a_study_among_others_has_its_table(smoke, name):
 
 
 def test_another_study_is_refused(studies):
-    with pytest.raises(InputError, match="study table5 has no runs of mixed: take study mixed, or all"):
+    with pytest.raises(InputError, match="study table5 has no runs of mixed part early: take study mixed, or all"):
         TABLES["mixed"](Results(), studies["table5"])
     with pytest.raises(InputError, match="study table5 has no runs of table4 part full"):
         TABLES["table4"](Results(), studies["table5"])

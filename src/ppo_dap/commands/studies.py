@@ -6,9 +6,14 @@ import argparse
 import json
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ppo_dap.commands.options import positive_count, seed
 from ppo_dap.errors import InputError
+
+if TYPE_CHECKING:
+    from ppo_dap.study.grids import Study
+    from ppo_dap.study.store import Store
 
 
 def seeds(text: str) -> list[int]:
@@ -58,6 +63,11 @@ def study_options(sub: argparse.ArgumentParser) -> None:
         help="runs with these labels alone: task, logs, arm, method, preset, part, ...; again for more",
     )
     sub.add_argument("--json", action="store_true", help="with --dry-run: print JSON")
+    sub.add_argument("--draw", action="store_true", help="run nothing: tables and figures of what there is")
+    text = "where its CSV files, tables and figures go (default: results in the store)"
+    sub.add_argument("--results", metavar="FOLDER", help=text)
+    text = "put the tables into this Markdown file, between its lines <!--study NAME--> and <!--/-->"
+    sub.add_argument("--document", metavar="FILE", help=text)
 
 
 def _cores() -> int:
@@ -72,7 +82,10 @@ def study(options: argparse.Namespace) -> int:
 
     if options.json and not options.dry_run:
         raise InputError("--json prints the plan: use it with --dry-run")
-    chosen = only(make_study(options.name, seeds=options.seeds, steps=options.steps), dict(options.only))
+    if options.dry_run and options.draw:
+        raise InputError("--dry-run lists cells and --draw draws what is there: name one of them")
+    whole = make_study(options.name, seeds=options.seeds, steps=options.steps)
+    chosen = only(whole, dict(options.only))
     plan = Plan(chosen, open_store(Path(options.store)), _speed)
     if options.dry_run:
         if options.json:
@@ -81,12 +94,47 @@ def study(options: argparse.Namespace) -> int:
         else:
             print_plan(plan, options.workers)
         return 0
-    from ppo_dap.study.supervise import raise_on_terminate, run_plan
+    folder, complete = Path(options.results or plan.store.root / "results"), True
+    if options.document is not None:
+        from ppo_dap.study.draw import fill
 
-    raise_on_terminate()
-    if plan.missing:
-        print(summary(plan, options.workers), flush=True)
-    return 0 if run_plan(plan, options.workers) else 1
+        fill(Path(options.document), {}, folder)  # a mistake is told before the work, not after it
+    if not options.draw:
+        from ppo_dap.study.supervise import raise_on_terminate, run_plan
+
+        raise_on_terminate()
+        if plan.missing:
+            print(summary(plan, options.workers), flush=True)
+        complete = run_plan(plan, options.workers)
+    _show(whole, plan.store, folder, options.document)
+    return 0 if complete else 1
+
+
+def _show(study: Study, store: Store, folder: Path, document: str | None) -> None:
+    """Keep the results of what is there of the whole study, and draw them."""
+    from ppo_dap.storage import write_atomically
+    from ppo_dap.study.draw import draw, fill, save_pages
+    from ppo_dap.study.proposal_figure import take_proposals
+    from ppo_dap.study.results import gather, load_results
+    from ppo_dap.study.studies import parts
+
+    results = gather(store, study.cells(), load_results(folder))
+    for part in parts(study):
+        if part.name == "fig11":
+            take_proposals(store, part, results)
+    results.save(folder)
+    pages = draw(study, results, folder)
+    if document is not None:
+        write_atomically(Path(document), fill(Path(document), pages, folder).encode())
+        files = [Path(document)]
+    else:
+        files = save_pages(study, pages, folder)
+    if not pages:
+        print(f"no run of {study.name} is finished: nothing to draw")
+    if len(pages) == 1:
+        print(*pages.values(), sep="\n")
+    for path in files:
+        print(path)
 
 
 def _speed(task: str) -> float:

@@ -19,7 +19,7 @@ PART = f"{WHOLE}: "
 
 def mixed(results: Results, study: Study) -> Drawn:
     """Two figures: ALC and final return of every method, and what `tuned-warm` changes without each of its parts."""
-    rows = results.rows(study)
+    rows = results.rows(study, part="early")
     methods = {arm: shown(own) for arm, own in arms(study).items() if not arm.startswith(PART)}
     parts = {arm: arm.removeprefix(PART) for arm in arms(study) if arm.startswith(PART)}
     found: Drawn = {}

@@ -26,7 +26,7 @@ WHOLE = TUNED_WARM.name
 
 def mixed(results: Results, study: Study) -> Table:
     """All arms; `tuned-warm` against each clone; and its difference to itself without each part."""
-    runs = view(results, study, "mixed")
+    runs = view(results, study, "mixed", "early")
     metrics = ["alc", "last_return", "seconds_per_step"]
     found, records = runs.effects(PPO.name, metrics), []
     for task, logs in runs.settings:
@@ -47,10 +47,13 @@ def mixed(results: Results, study: Study) -> Table:
     }
     notes = [READ, WALL, "The paper has no such logs."]
     more = [_clones(runs, study.epochs), _parts(runs, study.epochs)] if records else []
+    if any((entry.labels["study"], entry.labels["part"]) == ("mixed", "full") for entry in study.entries):
+        long = view(results, study, "mixed", "full")
+        more.append(_clones(long, study.epochs, f", runs of {long.steps:,} steps"))
     return listed("Logs of several gaits", records, columns, notes, 3, made_by(study, runs), more)
 
 
-def _clones(runs: View, epochs: float) -> Table:
+def _clones(runs: View, epochs: float, which: str = "") -> Table:
     """The whole against what has only its start, and against PPO."""
     baselines = [arm for arm, labels in runs.arms.items() if labels["method"] in ("ppo-bc", PPO.method)]
     measures = {"alc": f"ALC@{epochs:g}", "last_return": f"return after {runs.steps:,} steps"}
@@ -69,7 +72,7 @@ def _clones(runs: View, epochs: float) -> Table:
         "change": lambda row: change_text(row, row["pairs"]),
         **TESTS,
     }
-    return listed(f"{WHOLE} against clones and PPO", rows, columns, [TESTED], words=3)
+    return listed(f"{WHOLE} against clones and PPO{which}", rows, columns, [TESTED], words=3)
 
 
 def _parts(runs: View, epochs: float) -> Table:

@@ -44,13 +44,3 @@ FIGURES: dict[str, Callable[[Results, Study, Path], list[Path]]] = {
     name: functools.partial(_written, name) for name in DRAWINGS
 }
 """Study -> writes its figures into a folder, as .svg and .png; returns the files, none for a study without runs."""
-
-
-def draw(results: Results, study: Study, folder: Path) -> list[Path]:
-    """Every figure of a study that may be made of others (`all`, `smoke`), by the label `study` of its entries."""
-    paths = []
-    for name in dict.fromkeys(entry.labels["study"] for entry in study.entries):
-        if name in FIGURES:
-            entries = tuple(entry for entry in study.entries if entry.labels["study"] == name)
-            paths += FIGURES[name](results, dataclasses.replace(study, entries=entries), folder)
-    return paths

@@ -192,7 +192,7 @@ def mean_relative_change(
     within their task.
     """
 
-    def over_tasks(scores: Mapping[Any, Any]) -> float:
+    def over_tasks(scores: Mapping[Any, Any]) -> Any:
         return sum(map(_change, scores.values())) / len(scores)
 
     return stratified_bootstrap(pairs, over_tasks, reps, seed, level, at_once=True)

@@ -53,7 +53,7 @@ PARTS: tuple[tuple[str, dict[str, Any], dict[str, Any]], ...] = (
     ("KL never decayed", {"lambda_decay": None}, {}),
     ("imitation beside the KL", {"lambda_aux": 0.3}, {}),
     ("mode-seeking imitation", {"lambda_aux": 0.3, "mode_seeking": 1.0}, {}),
-    ("Q started", {"q_warm_start": True}, {}),
+    ("Q started in place of V", {"warm_start": "actor", "q_warm_start": True}, {}),
     ("asked for the top return", {"prior_return": "top"}, {"condition_on": "return", "logs_filter": 1.0}),
 )
 """What PPO-DAP (tuned-warm) is without a part, or with one more: (name, its options, those of its prior)."""
@@ -194,6 +194,7 @@ def mixed(s: Scale) -> Entries:
     ]
     yield from s.early(MIXED, s.ends(parts))
     if not s.brief:
+        yield from s.full(MIXED, [TUNED_WARM, BC, *clones])
         yield from s.early(MIXED, [Arm(m.row, m.name) for m in METHODS.values() if m.name not in ("ppo", "ppo-bc")])
 
 
@@ -252,11 +253,23 @@ def make_study(
         scale = dataclasses.replace(scale, many=tuple(seeds), few=tuple(seeds))
     if steps is not None:
         scale = dataclasses.replace(scale, early_steps=steps, full_steps=steps)
-    parts = list(STUDIES) if name in ("all", "smoke") else [name]
-    entries = [e._replace(labels={"study": part} | e.labels) for part in parts for e in STUDIES[part](scale)]
-    title = {"all": "every table and figure", "smoke": "every table and figure, tiny"}.get(name)
-    title = title or (STUDIES[name].__doc__ or "").splitlines()[0].rstrip(".")
+    names = list(STUDIES) if name in ("all", "smoke") else [name]
+    entries = [e._replace(labels={"study": part} | e.labels) for part in names for e in STUDIES[part](scale)]
+    title = {"all": "every table and figure", "smoke": "every table and figure, tiny"}.get(name) or _title(name)
     return Study(name, title, scale.epochs, tuple(entries))
+
+
+def _title(name: str) -> str:
+    return (STUDIES[name].__doc__ or "").splitlines()[0].rstrip(".")
+
+
+def parts(study: Study) -> list[Study]:
+    """The studies that one is made of: those that `all` and `smoke` join, or itself."""
+    names = dict.fromkeys(entry.labels["study"] for entry in study.entries)
+    return [
+        Study(name, _title(name), study.epochs, tuple(e for e in study.entries if e.labels["study"] == name))
+        for name in names
+    ]
 
 
 def only(study: Study, wanted: Mapping[str, Sequence[str]]) -> Study:
