@@ -45,7 +45,7 @@ def manifest() -> dict[str, Any]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "device": jax.devices()[0].device_kind,
-        "matmul_precision": jax.config.values["jax_default_matmul_precision"],
+        "matmul_precision": jax.config.jax_default_matmul_precision,  # type: ignore[attr-defined]
         "cpu_flags": _cpu_flags(),
         "NPROC": os.environ.get("NPROC"),
     }
