@@ -5,10 +5,11 @@ import pytest
 from ppo_dap.cli import main
 from ppo_dap.errors import InputError
 from ppo_dap.study import draw as drawing
-from ppo_dap.study.draw import draw, fill, save_pages
+from ppo_dap.study.draw import Page, draw, fill, save_pages
 from ppo_dap.study.grids import Scale
 from ppo_dap.study.results import Results, load_results
 from ppo_dap.study.studies import make_study, parts
+from ppo_dap.study.tables import TABLES
 
 
 class _Table:
@@ -17,6 +18,9 @@ class _Table:
 
     def markdown(self):
         return self.text
+
+    def csv(self):
+        return "rows\n"
 
 
 def _figure(results, study, folder):
@@ -29,7 +33,7 @@ def _figure(results, study, folder):
 @pytest.fixture
 def drawn(monkeypatch):
     """Tables and figures that say whose they are."""
-    tables = {n: lambda results, study: _Table(f"| {study.name} |\n\n| two |") for n in ("fig6", "table6")}
+    tables = {n: lambda results, study: _Table(f"| {study.name} |\n\n| two |") for n in TABLES}
     monkeypatch.setattr(drawing, "TABLES", tables)
     monkeypatch.setattr(drawing, "FIGURES", {"fig6": _figure, "fig10": _figure})
 
@@ -50,13 +54,14 @@ def test_each_part_has_its_tables_and_figures_and_an_empty_one_has_nothing(drawn
     results = _results(chosen["table6"])
     pages = draw(study, results, tmp_path / "results")
     # Table 6 and Figs 6, 11 share their runs; HalfCheetah's of Fig. 10 were not made.
-    assert pages["table6"] == "| table6 |\n\n| two |"
-    assert pages["fig6"] == f"| fig6 |\n\n| two |\n\n![{chosen['fig6'].title}](fig6.png)"
+    assert pages["table6"].text == "| table6 |\n\n| two |"
+    assert pages["fig6"].text == f"| fig6 |\n\n| two |\n\n![{chosen['fig6'].title}](fig6.png)"
     assert "fig10" not in pages
     assert sorted(path.name for path in (tmp_path / "results").iterdir()) == ["fig6.png", "fig6.svg"]
     files = save_pages(study, pages, tmp_path)
     text = (tmp_path / "fig6.md").read_text()
     assert tmp_path / "fig6.md" in files
+    assert (tmp_path / "fig6.csv").read_text() == "rows\n"
     assert text.startswith(f"# {chosen['fig6'].title}\n\n`ppo-dap study fig6`\n\n| fig6 |")
 
 
@@ -67,7 +72,11 @@ def test_blocks_of_a_document_are_filled_and_nothing_else_changes(tmp_path):
         "a\n<!--study one-->\nold\n<!--/-->\nb\n<!--other-->\n<!--study two-->\n<!--/-->\n"
         "<!--study three-->\nkept\n<!--/-->\n"
     )
-    pages = {"one": "| 1 |\n\n![title](one.png)", "two": "| 2 |\n\n[a link](elsewhere.md)", "four": "no block"}
+    pages = {
+        "one": Page("| 1 |\n\n![title](one.png)", ""),
+        "two": Page("| 2 |\n\n[a link](elsewhere.md)", ""),
+        "four": Page("no block", ""),
+    }
     again = fill(document, pages, tmp_path / "docs" / "results")
     assert again == (
         "a\n<!--study one-->\n| 1 |\n\n![title](results/one.png)\n<!--/-->\nb\n<!--other-->\n<!--study two-->\n"

@@ -132,7 +132,7 @@ def _show(study: Study, store: Store, folder: Path, document: str | None) -> Non
     if not pages:
         print(f"no run of {study.name} is finished: nothing to draw")
     if len(pages) == 1:
-        print(*pages.values(), sep="\n")
+        print(*(page.text for page in pages.values()))
     for path in files:
         print(path)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from ppo_dap.errors import InputError
 from ppo_dap.storage import write_atomically
@@ -18,36 +20,44 @@ BLOCK = re.compile(r"(<!--study (?P<name>[\w-]+)-->\n).*?(<!--/-->)", re.DOTALL)
 """Where a document takes a study in."""
 
 
-def draw(study: Study, results: Results, folder: Path) -> dict[str, str]:
-    """Write the figures of every part of the study to `folder`, each as .svg and .png.
+class Page(NamedTuple):
+    """What a part of a study comes to."""
 
-    Returns the Markdown of each part by its name: its tables, and its figures by paths relative to `folder`. Of a part
-    that has no run there is nothing.
+    text: str
+    """Markdown: its tables, and its figures by paths relative to the folder that they were written to."""
+    csv: str
+    """The rows behind the tables."""
+
+
+def draw(study: Study, results: Results, folder: Path) -> dict[str, Page]:
+    """Write the figures of every part of the study to `folder`, each as .svg and .png; returns a page a part.
+
+    Of a part that has no run there is nothing.
     """
     pages = {}
     for part in parts(study):
         if not results.rows(part):
             continue
         folder.mkdir(parents=True, exist_ok=True)
-        blocks = [TABLES[part.name](results, part).markdown()] if part.name in TABLES else []
-        if part.name in FIGURES:
-            files = FIGURES[part.name](results, part, folder)
-            blocks += [f"![{part.title}]({path.name})" for path in files if path.suffix == ".png"]
-        pages[part.name] = "\n\n".join(blocks)
+        table = TABLES[part.name](results, part)
+        files = FIGURES[part.name](results, part, folder) if part.name in FIGURES else []
+        figures = [f"![{part.title}]({path.name})" for path in files if path.suffix == ".png"]
+        pages[part.name] = Page("\n\n".join([table.markdown(), *figures]), table.csv())
     return pages
 
 
-def save_pages(study: Study, pages: dict[str, str], folder: Path) -> list[Path]:
-    """Write each page to `folder`/NAME.md."""
+def save_pages(study: Study, pages: Mapping[str, Page], folder: Path) -> list[Path]:
+    """Write each page to `folder`/NAME.md, and its rows to NAME.csv; returns the former."""
     titles = {part.name: part.title for part in parts(study)}
     files = []
     for name, page in pages.items():
         files.append(folder / f"{name}.md")
-        write_atomically(files[-1], f"# {titles[name]}\n\n`ppo-dap study {name}`\n\n{page}\n".encode())
+        write_atomically(files[-1], f"# {titles[name]}\n\n`ppo-dap study {name}`\n\n{page.text}\n".encode())
+        write_atomically(folder / f"{name}.csv", page.csv.encode())
     return files
 
 
-def fill(document: Path, pages: dict[str, str], folder: Path) -> str:
+def fill(document: Path, pages: Mapping[str, Page], folder: Path) -> str:
     """The text of a document with every block `<!--study NAME-->` ... `<!--/-->` of these pages filled anew.
 
     Paths of figures, which lie in `folder`, become relative to the document. Raises `InputError` for a document that
@@ -64,6 +74,6 @@ def fill(document: Path, pages: dict[str, str], folder: Path) -> str:
         page = pages.get(found["name"])
         if page is None:
             return found[0]
-        return found[1] + re.sub(r"(!\[[^]]*\]\()", rf"\g<1>{place}/", page) + "\n" + found[3]
+        return found[1] + re.sub(r"(!\[[^]]*\]\()", rf"\g<1>{place}/", page.text) + "\n" + found[3]
 
     return BLOCK.sub(filled, text)
