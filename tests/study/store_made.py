@@ -11,7 +11,7 @@ from ppo_dap.study.grids import Entry, Study
 from ppo_dap.study.plan import Plan
 from ppo_dap.study.show import Show
 from ppo_dap.study.store import Store
-from ppo_dap.study.supervise import Supervisor
+from ppo_dap.study.supervise import Supervisor, launch_here
 
 COMMAND = (sys.executable, str(Path(__file__).with_name("stub_worker.py")))
 
@@ -34,14 +34,19 @@ def study(*cells):
     return Study("stub", "a stub", 1.0, tuple(Entry(cell, {"seed": cell.settings.get("seed", 0)}) for cell in cells))
 
 
-def small_grid(**how):
-    """Two first cells, and four runs on each."""
-    return study(*(target(10 * b + i, base(b, **how), **how) for b in range(2) for i in range(4)))
+def small_grid(runs=4, **how):
+    """Two first cells, and four runs on each, or another number."""
+    return study(*(target(10 * b + i, base(b, **how), **how) for b in range(2) for i in range(runs)))
 
 
-def supervisor(root, grid, workers=2, lease=claims.LEASE, command=COMMAND):
+def supervisor(root, grid, workers=2, lease=claims.LEASE, command=COMMAND, launch=launch_here):
     plan = Plan(grid, Store(root), lambda task: 1e9)
-    return Supervisor(plan, workers, Show(), command, Watch(lease), poll=0.05)
+    return Supervisor(plan, workers, Show(), command, launch, Watch(lease), poll=0.05)
+
+
+def made(root):
+    """How often each cell was made to the end."""
+    return [len(path.read_text().splitlines()) for path in Path(root).rglob("made")]
 
 
 def contents(root):

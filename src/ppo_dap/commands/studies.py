@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 from pathlib import Path
@@ -13,6 +14,7 @@ from ppo_dap.errors import InputError
 
 if TYPE_CHECKING:
     from ppo_dap.study.grids import Study
+    from ppo_dap.study.plan import Plan
     from ppo_dap.study.store import Store
 
 
@@ -49,9 +51,9 @@ def study_options(sub: argparse.ArgumentParser) -> None:
     text = "where everything is kept; studies, and machines, can share it (default: %(default)s)"
     sub.add_argument("--store", default="studies", metavar="FOLDER", help=text)
     sub.add_argument("--dry-run", action="store_true", help="list the cells, hours and disk, and do nothing")
-    sub.add_argument(
-        "--workers", type=positive_count, default=_cores(), metavar="N", help="processes, a core each (default: cores)"
-    )
+    sub.add_argument("--workers", type=positive_count, metavar="N", help="processes, a core each (default: cores)")
+    text = "make the cells on this Ray cluster (HOST:PORT, auto or local); its nodes share the store's folder"
+    sub.add_argument("--ray", metavar="ADDRESS", help=text)
     sub.add_argument("--seeds", type=seeds, metavar="0-7", help="for all seeds that the study declares")
     sub.add_argument("--steps", type=positive_count, metavar="N", help="for all numbers of steps that it declares")
     sub.add_argument(
@@ -76,7 +78,7 @@ def _cores() -> int:
 
 def study(options: argparse.Namespace) -> int:
     """Plan a study and run what is missing; exit code 1 if a cell could not be made."""
-    from ppo_dap.study.plan import Plan, print_plan, summary
+    from ppo_dap.study.plan import Plan, print_plan
     from ppo_dap.study.store import open_store
     from ppo_dap.study.studies import make_study, only
 
@@ -84,6 +86,8 @@ def study(options: argparse.Namespace) -> int:
         raise InputError("--json prints the plan: use it with --dry-run")
     if options.dry_run and options.draw:
         raise InputError("--dry-run lists cells and --draw draws what is there: name one of them")
+    if options.ray is not None and (options.dry_run or options.draw):
+        raise InputError("--ray runs cells, --dry-run and --draw run none: leave it out, or name --workers")
     whole = make_study(options.name, seeds=options.seeds, steps=options.steps)
     chosen = only(whole, dict(options.only))
     plan = Plan(chosen, open_store(Path(options.store)), _speed)
@@ -92,7 +96,7 @@ def study(options: argparse.Namespace) -> int:
             cells = [cell.description() | {"done": cell in plan.done, "text": str(cell)} for cell in plan.cells]
             print(json.dumps(plan.totals() | {"study": chosen.name, "list": cells}))
         else:
-            print_plan(plan, options.workers)
+            print_plan(plan, options.workers or _cores())
         return 0
     folder, complete = Path(options.results or plan.store.root / "results"), True
     if options.document is not None:
@@ -100,14 +104,27 @@ def study(options: argparse.Namespace) -> int:
 
         fill(Path(options.document), {}, folder)  # a mistake is told before the work, not after it
     if not options.draw:
-        from ppo_dap.study.supervise import raise_on_terminate, run_plan
-
-        raise_on_terminate()
-        if plan.missing:
-            print(summary(plan, options.workers), flush=True)
-        complete = run_plan(plan, options.workers)
+        complete = _run(plan, options)
     _show(whole, plan.store, folder, options.document)
     return 0 if complete else 1
+
+
+def _run(plan: Plan, options: argparse.Namespace) -> bool:
+    """Make what is missing, here or on a Ray cluster; returns whether everything is there."""
+    from ppo_dap.study.plan import summary
+    from ppo_dap.study.supervise import launch_here, raise_on_terminate, run_plan
+
+    raise_on_terminate()
+    with contextlib.ExitStack() as stack:
+        launch, workers = launch_here, options.workers or _cores()
+        if options.ray is not None and plan.missing:
+            from ppo_dap.study.ray_cluster import Cluster
+
+            cluster = stack.enter_context(Cluster(options.ray, plan.store.root))
+            launch, workers = cluster.launch, options.workers or cluster.cpus
+        if plan.missing:
+            print(summary(plan, workers), flush=True)
+        return run_plan(plan, workers, launch=launch)
 
 
 def _show(study: Study, store: Store, folder: Path, document: str | None) -> None:

@@ -9,7 +9,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +28,44 @@ DEATHS = 12
 """So is one whose worker was killed this often without a checkpoint in between."""
 
 
+@dataclass(frozen=True)
+class Worker:
+    """A worker's process, wherever it runs."""
+
+    ended: Future[tuple[int | None, str]]
+    """Its exit code (-n: killed by signal n; None: lost, with its machine) and the last line of its stderr, or the
+    reason of its loss."""
+    interrupt: Callable[[], None]
+    """Asks it to stop, as Ctrl-C does."""
+    kill: Callable[[], None]
+    """Ends it at once."""
+
+
+Launch = Callable[[Sequence[str]], Worker]
+"""Starts a worker's command somewhere."""
+
+
+def launch_here(command: Sequence[str]) -> Worker:
+    """Start a worker on this machine, in a session of its own: Ctrl-C reaches it through us alone, and once."""
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"NPROC": "1"},
+        start_new_session=True,
+    )
+    ended: Future[tuple[int | None, str]] = Future()
+
+    def attend() -> None:
+        _, errors = process.communicate()
+        lines = errors.decode(errors="replace").strip().splitlines()
+        ended.set_result((process.returncode, lines[-1] if lines else ""))
+
+    threading.Thread(target=attend, daemon=True).start()
+    return Worker(ended, lambda: process.send_signal(signal.SIGINT), process.kill)
+
+
 @dataclass
 class Supervisor:
     """Starts a worker for each cell that can be made, and counts how they end."""
@@ -35,12 +74,13 @@ class Supervisor:
     workers: int
     show: Show
     command: Sequence[str] = COMMAND
+    launch: Launch = launch_here
     watch: Watch = field(default_factory=Watch)
     poll: float = 2.0
     """Seconds between two looks at what other supervisors do."""
     failed: dict[Cell, str] = field(default_factory=dict)
     """Cells that were given up, with the error's last line."""
-    running: dict[Cell, subprocess.Popen] = field(default_factory=dict)
+    running: dict[Cell, Worker] = field(default_factory=dict)
 
     def __post_init__(self):
         self.store = self.plan.store
@@ -50,7 +90,7 @@ class Supervisor:
         self._before = {cell: len(self.store.failures(cell.name)) for cell in self.open}
         self._errors: dict[Cell, list[str]] = {}
         self._deaths: dict[Cell, tuple[Any, int]] = {}
-        self._ended: queue.Queue[tuple[Cell, int, str]] = queue.Queue()
+        self._ended: queue.Queue[tuple[Cell, Future[tuple[int | None, str]]]] = queue.Queue()
 
     def run(self) -> bool:
         """Until there is nothing left to do; returns whether everything is done. After Ctrl-C workers end at their
@@ -101,25 +141,10 @@ class Supervisor:
 
     def _start(self, cell: Cell, number: int) -> None:
         self.store.prepare(cell)
-        arguments = [*self.command, str(self.store.root), cell.name, str(number)]
-        # A session of its own: Ctrl-C reaches a worker through us alone, and once.
-        process = subprocess.Popen(
-            arguments,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            env=os.environ | {"NPROC": "1"},
-            start_new_session=True,
-        )
+        worker = self.launch([*self.command, str(self.store.root.absolute()), cell.name, str(number)])
         del self.open[cell]
-        self.running[cell] = process
-
-        def attend() -> None:
-            _, errors = process.communicate()
-            lines = errors.decode(errors="replace").strip().splitlines()
-            self._ended.put((cell, process.returncode, lines[-1] if lines else ""))
-
-        threading.Thread(target=attend, daemon=True).start()
+        self.running[cell] = worker
+        worker.ended.add_done_callback(lambda ended: self._ended.put((cell, ended)))
 
     def _wait(self) -> None:
         """Until a worker ends, or for `poll` seconds."""
@@ -129,33 +154,32 @@ class Supervisor:
                 ended.append(self._ended.get())
         except queue.Empty:
             return
-        for cell, code, line in ended:
+        for cell, how in ended:
             del self.running[cell]
-            self._judge(cell, code, line)
+            self._judge(cell, *how.result())
 
-    def _judge(self, cell: Cell, code: int, line: str) -> None:
+    def _judge(self, cell: Cell, code: int | None, line: str) -> None:
         if code == DONE:
             self._settle(cell)
             return
         self.open[cell] = None
         if code in (TAKEN, LOST, STOPPED):
             return
-        if code < 0 or code > 128:
-            self._died(cell, code)
+        if code is None or code < 0 or code > 128:
+            self._died(cell, line if code is None else signal.Signals(-code).name if code < 0 else f"code {code}")
         else:
             self._errors.setdefault(cell, []).append(line or f"its worker ended with code {code}")
         if not self._give_up(cell) and code == FAILED:
             self.show.say(f"{cell}: failed, is tried once more: {line}")
 
-    def _died(self, cell: Cell, code: int) -> None:
+    def _died(self, cell: Cell, how: str) -> None:
         """Killed, by whomever: begun again, unless it never gets any further (it may be short of memory)."""
-        name = signal.Signals(-code).name if code < 0 else f"code {code}"
         reached = [path.stat().st_mtime_ns for path in self.store.out(cell).rglob("last.safetensors")]
         before, count = self._deaths.get(cell, (None, 0))
         self._deaths[cell] = reached, count + 1 if before == reached else 1
-        self.show.say(f"{cell}: its worker was killed ({name}), goes on")
+        self.show.say(f"{cell}: its worker was killed ({how}), goes on")
         if self._deaths[cell][1] >= DEATHS:
-            self._errors[cell] = [f"its worker was killed {DEATHS} times ({name}) and got no further"] * ATTEMPTS
+            self._errors[cell] = [f"its worker was killed {DEATHS} times ({how}) and got no further"] * ATTEMPTS
 
     def _give_up(self, cell: Cell) -> bool:
         """Whether the cell has failed too often, here and at other supervisors together."""
@@ -178,13 +202,12 @@ class Supervisor:
         """End the workers: as a person at their terminal would."""
         self.show.say(f"stopping: {len(self.running)} workers write their checkpoints")
         try:
-            for process in self.running.values():
-                process.send_signal(signal.SIGINT)
-            for process in self.running.values():
-                process.wait()
+            for worker in self.running.values():
+                worker.interrupt()
+            wait([worker.ended for worker in self.running.values()])
         except KeyboardInterrupt:
-            for process in self.running.values():
-                process.kill()
+            for worker in self.running.values():
+                worker.kill()
 
 
 def raise_on_terminate() -> None:
@@ -196,13 +219,13 @@ def raise_on_terminate() -> None:
     signal.signal(signal.SIGTERM, stop)
 
 
-def run_plan(plan: Plan, workers: int, show: Show | None = None) -> bool:
+def run_plan(plan: Plan, workers: int, show: Show | None = None, launch: Launch = launch_here) -> bool:
     """Make what is missing; returns whether everything is there now, and prints what is not.
 
     Raises `InputError` for a store that holds a cell under other settings, `OSError` for one that cannot be written.
     """
     start = time.perf_counter()
-    supervisor = Supervisor(plan, workers, show or Show())
+    supervisor = Supervisor(plan, workers, show or Show(), launch=launch)
     complete = supervisor.run()
     taken = (time.perf_counter() - start) / 3600
     count = f"{len(supervisor.done)} of {len(plan.cells)}"

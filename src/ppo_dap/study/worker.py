@@ -181,7 +181,7 @@ def _reliability(cell: Mapping[str, Any], out: Path, needs: Mapping[str, Path]) 
     write_atomically(out / "report.json", json.dumps(found.report).encode())
 
 
-def main(arguments: Sequence[str] | None = None, make: Make = make_cell) -> int:
+def main(arguments: Sequence[str] | None = None, make: Make = make_cell, beat: float = BEAT) -> int:
     """The command of a worker's process."""
     parser = argparse.ArgumentParser(prog="ppo_dap.study.worker", description=__doc__)
     parser.add_argument("store", type=Path)
@@ -189,7 +189,7 @@ def main(arguments: Sequence[str] | None = None, make: Make = make_cell) -> int:
     parser.add_argument("claim", type=int)
     options = parser.parse_args(arguments)
     try:
-        return work(Store(options.store), options.cell, options.claim, make)
+        return work(Store(options.store), options.cell, options.claim, make, beat)
     except OSError as error:
         print(told(error), file=sys.stderr)
         return FAILED
