@@ -50,7 +50,9 @@ HEAVY = {
     "h5py",
     "pyarrow",
     "imageio",
+    "ray",
     "scipy",
+    "sklearn",
 }
 
 

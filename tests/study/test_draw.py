@@ -1,5 +1,7 @@
 """From results to documents: which block gets what, and what stays as it was."""
 
+from pathlib import Path
+
 import pytest
 
 from ppo_dap.cli import main
@@ -122,3 +124,11 @@ def test_drawing_runs_nothing_and_keeps_what_was_measured(drawn, tmp_path, capsy
     assert main(["study", "fig6", *options, "--document", str(tmp_path / "no.md")]) == 2
     told = capsys.readouterr().err.splitlines()
     assert [line.split(": ", 1)[1].split(" ")[0] for line in told] == ["--dry-run", "document"]
+
+
+def test_the_documents_tables_are_those_of_the_committed_files(tmp_path):
+    document = Path(__file__).parents[2] / "docs" / "results.md"
+    pages = draw(make_study("mixed"), load_results(document.parent / "results"), tmp_path)
+    assert "mixed" in pages
+    assert fill(document, pages, document.parent / "results") == document.read_text()
+    assert {path.name for path in tmp_path.iterdir()} <= {path.name for path in (document.parent / "results").iterdir()}

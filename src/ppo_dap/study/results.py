@@ -36,6 +36,8 @@ WORST = {"spr": min, "pgshare": min, "oglr": max, "batch_fresh": min}
 """Measures of the audit (5.8), each by its worst iteration."""
 WORDS = ("cell", "of", "task", "logs", "method", "preset", "options")
 """Columns whose values are no numbers, whatever they look like."""
+COUNTS = ("seed", "steps", "env_steps", "state", "guided", "drawn")
+"""Columns of whole numbers."""
 SETTLED = 2
 """Iterations in which programs are compiled: their seconds are no part of a run's cost."""
 
@@ -192,17 +194,15 @@ def _read(path: Path) -> list[Row]:
     for row in rows:
         if "cell" not in row or None in row or None in row.values():  # a line that is too long, or too short
             raise InputError(f"{path} is damaged at {list(row.values())[:3]}: make it again with ppo-dap study")
-    return [{name: text if name in WORDS else _value(text) for name, text in row.items()} for row in rows]
+    return [{name: _value(name, text) for name, text in row.items()} for row in rows]
 
 
-def _value(text: str) -> Any:
-    if not text:
-        return None
-    if text in ("True", "False"):
-        return text == "True"
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+def _value(name: str, text: str) -> Any:
+    if name in WORDS:
+        return text
+    if not text or text in ("True", "False"):
+        return None if not text else text == "True"
+    try:
+        return int(text) if name in COUNTS else float(text)
+    except ValueError:
+        return text
