@@ -15,8 +15,8 @@ quickstart: .venv/.ready  ## fit a prior on the shipped logs, train PPO and PPO-
 test: lint  ## lint, then run every test
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-smoke: .venv/.ready  ## a tiny version of every study, end to end, on two cores
-	$(BIN)/python -m pytest -m smoke tests/study/test_smoke.py
+smoke: .venv/.ready  ## what takes longer: a tiny version of every study, killed runs, a Ray cluster, a browser
+	$(BIN)/python -m pytest -m smoke tests/study
 
 lint: .venv/.ready  ## style, formatting and types
 	$(BIN)/ruff check .

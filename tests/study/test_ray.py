@@ -25,6 +25,8 @@ from ppo_dap.study.store import open_store
 from ppo_dap.study.studies import STUDIES
 from study.store_made import COMMAND, base, contents, made, small_grid, study, supervisor
 
+pytestmark = pytest.mark.smoke
+
 GRID = small_grid(runs=2, slow=0.15)
 PYTHON = sys.executable
 

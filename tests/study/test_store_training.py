@@ -8,9 +8,13 @@ import sys
 import threading
 import time
 
+import pytest
+
 from ppo_dap.study import cells
 from ppo_dap.study.store import Store
 from study.store_made import study, supervisor
+
+pytestmark = pytest.mark.smoke
 
 OPTIONS = {
     "num_envs": 4, "rollout_steps": 128, "minibatch_size": 64, "num_epochs": 2, "eval_every": 512, "eval_episodes": 1,
