@@ -140,7 +140,7 @@ def _show(study: Study, store: Store, folder: Path, document: str | None) -> Non
         if part.name == "fig11":
             take_proposals(store, part, results)
     results.save(folder)
-    pages = draw(study, results, folder)
+    pages = draw(study, load_results(folder), folder)  # from the files, whose numbers are rounded: the same ever after
     if document is not None:
         write_atomically(Path(document), fill(Path(document), pages, folder).encode())
         files = [Path(document)]
