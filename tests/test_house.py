@@ -32,6 +32,20 @@ ALLOWED = {
     "study": {"training", *_LEARNING, *_DATA, *_BASE},
 }
 EVERYTHING = {"__init__", "cli", "commands"}  # the public face and the commands: they import all, nothing imports them
+# The same within ppo_dap.study.
+STUDY = {
+    "stats": set(),
+    "plots": set(),
+    "diagnostics": {"plots"},
+    "store": {"stats", "diagnostics"},
+    "results": {"stats", "store"},
+    "tables": {"stats", "store", "results"},
+    "figures": {"stats", "plots", "diagnostics", "store", "results"},
+    "draw": {"store", "results", "tables", "figures"},
+    "report": {"stats", "plots", "store"},
+    "bench": {"plots"},
+    "quickstart": {"stats", "plots"},
+}
 
 MAX_FILE_LINES = 350
 MAX_FUNCTION_LINES = 60
@@ -56,42 +70,44 @@ HEAVY = {
 }
 
 
-def _imported_modules(node: ast.AST, module: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Dotted names under ppo_dap that one import statement of `module` (its folder's dotted name) reaches."""
+def _imported_modules(node: ast.AST, module: tuple[str, ...], root: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Dotted names under `root`, less it, that an import statement of `module` (its folder's dotted name) reaches."""
     if isinstance(node, ast.Import):
         names = [tuple(alias.name.split(".")) for alias in node.names]
     elif isinstance(node, ast.ImportFrom):
         start = module[: len(module) - node.level + 1] if node.level else ()
         base = start + tuple(node.module.split(".") if node.module else ())
-        names = [(*base, alias.name) for alias in node.names] if len(base) == 1 else [base]
+        names = [(*base, alias.name) for alias in node.names] if base == root else [base]
     else:
         names = []
-    return [name for name in names if name[0] == "ppo_dap"]
+    return [name[len(root) :] for name in names if name[: len(root)] == root]
 
 
 def _part(name: tuple[str, ...], package: Path) -> str:
-    """The top-level part that a dotted name under ppo_dap belongs to; a public function belongs to `__init__`."""
-    if len(name) > 1 and ((package / name[1]).is_dir() or (package / f"{name[1]}.py").is_file()):
-        return name[1]
+    """The part of a package that a dotted name under it belongs to; a public function belongs to `__init__`."""
+    if name and ((package / name[0]).is_dir() or (package / f"{name[0]}.py").is_file()):
+        return name[0]
     return "__init__"
 
 
-def wrong_imports(package: Path) -> list[str]:
-    """`file:line: part imports part` for every import of the package against the allowed direction."""
+def wrong_imports(
+    package: Path, allowed: dict[str, set[str]] = ALLOWED, root: tuple[str, ...] = ("ppo_dap",)
+) -> list[str]:
+    """`file:line: part imports part` for every import of the package `root` against the allowed direction."""
     found = []
     for file in sorted(package.rglob("*.py")):
         relative = file.relative_to(package)
         part = relative.parts[0] if len(relative.parts) > 1 else relative.stem
         if part in EVERYTHING:
             continue
-        if part not in ALLOWED:
-            found.append(f"{relative}:1: {part} has no place in ALLOWED")
+        if part not in allowed:
+            found.append(f"{relative}:1: {part} has no place among the parts that are allowed")
             continue
-        folder = ("ppo_dap", *relative.parts[:-1])
+        folder = (*root, *relative.parts[:-1])
         for node in ast.walk(ast.parse(file.read_text())):
-            for name in _imported_modules(node, folder):
+            for name in _imported_modules(node, folder, root):
                 target = _part(name, package)
-                if target != part and target not in ALLOWED[part]:
+                if target != part and target not in allowed[part]:
                     found.append(f"{relative}:{node.lineno}: {part} imports {target}")
     return found
 
@@ -135,6 +151,26 @@ def _write(root: Path, **files: str) -> Path:
 
 def test_imports_point_one_way():
     assert wrong_imports(PACKAGE) == []
+    assert wrong_imports(PACKAGE / "study", STUDY, ("ppo_dap", "study")) == []
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "from ppo_dap.study.store.cells import run",
+        "from ppo_dap.study.results import gather",
+        "from ppo_dap.study import store",
+        "from .. import store",
+        "import ppo_dap.study.tables.studies",
+    ],
+)
+def test_an_import_against_the_direction_within_studies_is_found(tmp_path, statement):
+    _write(tmp_path, **{f"{part}__fine": "from ppo_dap.training.run import Run\n" for part in STUDY})
+    _write(tmp_path, tables__good="from ppo_dap.study.stats import fine\nfrom ..store import fine as again\n")
+    assert wrong_imports(tmp_path, STUDY, ("ppo_dap", "study")) == []
+    _write(tmp_path, stats__planted=statement)
+    (found,) = wrong_imports(tmp_path, STUDY, ("ppo_dap", "study"))
+    assert found.startswith("stats/planted.py:1: stats imports ")
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,10 @@
 import math
 from dataclasses import dataclass
 
-from ppo_dap.study.cells import Cell
-from ppo_dap.study.grids import Scale
 from ppo_dap.study.results import Results
-from ppo_dap.study.statistics import EPOCH
+from ppo_dap.study.stats.measures import EPOCH
+from ppo_dap.study.store.cells import Cell
+from ppo_dap.study.store.grids import Scale
 
 HOLDS = {"strictly_on_policy": True, "as_declared": True, "oglr": 0.0, "spr": 1.0, "pgshare": 0.95, "batch_fresh": 1.0}
 COST = {"env_steps": 1000, "seconds_iteration": 2.0, "seconds_env": 1.5, "peak_mib": 400.0}

@@ -8,10 +8,10 @@ from ppo_dap.cli import main
 from ppo_dap.errors import InputError
 from ppo_dap.study import draw as drawing
 from ppo_dap.study.draw import Page, draw, fill, save_pages
-from ppo_dap.study.grids import Scale
 from ppo_dap.study.results import Results, load_results
-from ppo_dap.study.studies import make_study, parts
-from ppo_dap.study.tables import TABLES
+from ppo_dap.study.store.grids import Scale
+from ppo_dap.study.store.studies import make_study, parts
+from ppo_dap.study.tables.studies import TABLES
 
 
 class _Table:

@@ -6,10 +6,10 @@ import math
 import pytest
 
 from ppo_dap.errors import InputError
-from ppo_dap.study import cells
 from ppo_dap.study.results import Results, gather, load_results
-from ppo_dap.study.store import Store
-from study.store_made import study
+from ppo_dap.study.store import cells
+from ppo_dap.study.store.store import Store
+from study.store.store_made import study
 
 EVALUATIONS = [
     {"env_steps": steps, "return_mean": value, "return_std": 1.0, "episodes": 1, "length_mean": 10.0 * i}

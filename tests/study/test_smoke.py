@@ -8,8 +8,8 @@ import pytest
 
 from ppo_dap.study.draw import draw
 from ppo_dap.study.results import load_results
-from ppo_dap.study.store import Store
-from ppo_dap.study.studies import STUDIES, make_study
+from ppo_dap.study.store.store import Store
+from ppo_dap.study.store.studies import STUDIES, make_study
 
 
 @pytest.mark.smoke

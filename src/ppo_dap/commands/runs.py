@@ -44,8 +44,8 @@ def evaluate(options: argparse.Namespace) -> int:
 
 def bench(options: argparse.Namespace) -> int:
     """The benchmark."""
-    from ppo_dap.study.bench import bench, print_bench
-    from ppo_dap.study.sweep import sweep
+    from ppo_dap.study.bench.bench import bench, print_bench
+    from ppo_dap.study.bench.sweep import sweep
     from ppo_dap.tasks import describe
 
     tasks = options.task or ["Walker2d-v5", "HalfCheetah-v5"]
@@ -82,8 +82,8 @@ def audit(options: argparse.Namespace) -> int:
 def reliability(options: argparse.Namespace) -> int:
     """How far a run's Q can be trusted (5.7)."""
     prepare_jax()
-    from ppo_dap.study import reliability_report as study
-    from ppo_dap.study.diagnostic_figures import require_png
+    from ppo_dap.study.diagnostics import reliability_report as study
+    from ppo_dap.study.plots.png import require_png
 
     png = None if options.png is None else require_png(options.png)
     names = ("states", "rollouts", "horizon", "checkpoint", "seed")
@@ -95,8 +95,8 @@ def reliability(options: argparse.Namespace) -> int:
 def bound(options: argparse.Namespace) -> int:
     """The terms of Eq. 14 by iteration."""
     prepare_jax()
-    from ppo_dap.study import bound as study
-    from ppo_dap.study.diagnostic_figures import require_png
+    from ppo_dap.study.diagnostics import bound as study
+    from ppo_dap.study.plots.png import require_png
 
     png = None if options.png is None else require_png(options.png)
     found = study.bound(options.folder)
@@ -116,8 +116,8 @@ def _diagnosed(found: Any, as_json: bool, show: Callable, png: Path | None, draw
 
 def summary(options: argparse.Namespace) -> int:
     """Runs side by side, or methods against a baseline."""
-    from ppo_dap.study.compare import comparable, compare, markdown, overall, print_comparison, save_csv
-    from ppo_dap.study.summary import print_summary, summarise
+    from ppo_dap.study.stats.compare import comparable, compare, markdown, overall, print_comparison, save_csv
+    from ppo_dap.study.stats.summary import print_summary, summarise
     from ppo_dap.training.run import load_run
 
     if options.markdown and options.compare is None:
@@ -146,7 +146,7 @@ def summary(options: argparse.Namespace) -> int:
 
 def report(options: argparse.Namespace) -> int:
     """A page of runs; exit code 1 on a violation that a method does not declare."""
-    from ppo_dap.study.report import write_report
+    from ppo_dap.study.report.page import write_report
 
     command = ["ppo-dap", "report", *options.folders, "--out", options.out, "--epochs", f"{options.epochs:g}"]
     command += [] if options.compare is None else ["--compare", options.compare]

@@ -13,9 +13,9 @@ from ppo_dap.commands.options import positive_count, seed
 from ppo_dap.errors import InputError
 
 if TYPE_CHECKING:
-    from ppo_dap.study.grids import Study
-    from ppo_dap.study.plan import Plan
-    from ppo_dap.study.store import Store
+    from ppo_dap.study.store.grids import Study
+    from ppo_dap.study.store.plan import Plan
+    from ppo_dap.study.store.store import Store
 
 
 def seeds(text: str) -> list[int]:
@@ -78,9 +78,9 @@ def _cores() -> int:
 
 def study(options: argparse.Namespace) -> int:
     """Plan a study and run what is missing; exit code 1 if a cell could not be made."""
-    from ppo_dap.study.plan import Plan, print_plan
-    from ppo_dap.study.store import open_store
-    from ppo_dap.study.studies import make_study, only
+    from ppo_dap.study.store.plan import Plan, print_plan
+    from ppo_dap.study.store.store import open_store
+    from ppo_dap.study.store.studies import make_study, only
 
     if options.json and not options.dry_run:
         raise InputError("--json prints the plan: use it with --dry-run")
@@ -111,14 +111,14 @@ def study(options: argparse.Namespace) -> int:
 
 def _run(plan: Plan, options: argparse.Namespace) -> bool:
     """Make what is missing, here or on a Ray cluster; returns whether everything is there."""
-    from ppo_dap.study.plan import summary
-    from ppo_dap.study.supervise import launch_here, raise_on_terminate, run_plan
+    from ppo_dap.study.store.plan import summary
+    from ppo_dap.study.store.supervise import launch_here, raise_on_terminate, run_plan
 
     raise_on_terminate()
     with contextlib.ExitStack() as stack:
         launch, workers = launch_here, options.workers or _cores()
         if options.ray is not None and plan.missing:
-            from ppo_dap.study.ray_cluster import Cluster
+            from ppo_dap.study.store.ray_cluster import Cluster
 
             cluster = stack.enter_context(Cluster(options.ray, plan.store.root))
             launch, workers = cluster.launch, options.workers or cluster.cpus
@@ -131,9 +131,9 @@ def _show(study: Study, store: Store, folder: Path, document: str | None) -> Non
     """Keep the results of what is there of the whole study, and draw them."""
     from ppo_dap.storage import write_atomically
     from ppo_dap.study.draw import draw, fill, save_pages
-    from ppo_dap.study.proposal_figure import take_proposals
+    from ppo_dap.study.figures.proposals import take_proposals
     from ppo_dap.study.results import gather, load_results
-    from ppo_dap.study.studies import parts
+    from ppo_dap.study.store.studies import parts
 
     results = gather(store, study.cells(), load_results(folder))
     for part in parts(study):

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 from ppo_dap.errors import InputError
 from ppo_dap.storage import write_atomically
-from ppo_dap.study.grids import Study
-from ppo_dap.study.paper_figures import FIGURES
+from ppo_dap.study.figures.studies import FIGURES
 from ppo_dap.study.results import Results
-from ppo_dap.study.studies import parts
-from ppo_dap.study.tables import TABLES
+from ppo_dap.study.store.grids import Study
+from ppo_dap.study.store.studies import parts
+from ppo_dap.study.tables.studies import TABLES
 
 BLOCK = re.compile(r"(<!--study (?P<name>[\w-]+)-->\n).*?(<!--/-->)", re.DOTALL)
 """Where a document takes a study in."""

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from ppo_dap.errors import PPODAPError
-from ppo_dap.study.summary import print_summary, summarise
+from ppo_dap.study.stats.summary import print_summary, summarise
 from ppo_dap.training.run import Run, load_run
 
 SAMPLE, TASK, STEPS, EPOCHS, SEEDS = "hopper-medium", "Hopper-v5", 200_000, 40, (0, 1)
@@ -76,7 +76,7 @@ def _command(*arguments: str) -> str:
 
 
 def _draw(runs: dict[tuple[str, int], Run], path: Path) -> None:
-    from ppo_dap.study.figures import learning_curves
+    from ppo_dap.study.plots.curves import learning_curves
 
     names = {"PPO": "ppo", "PPO-DAP (tuned)": "ppo-dap"}
     groups = {label: [runs[method, seed] for seed in SEEDS] for label, method in names.items()}

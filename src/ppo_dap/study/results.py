@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 from ppo_dap.errors import InputError
 from ppo_dap.storage import write_atomically
-from ppo_dap.study.statistics import EPOCH, alc
+from ppo_dap.study.stats.measures import EPOCH, alc
 
 if TYPE_CHECKING:
-    from ppo_dap.study.cells import Cell
-    from ppo_dap.study.grids import Study
-    from ppo_dap.study.store import Store
+    from ppo_dap.study.store.cells import Cell
+    from ppo_dap.study.store.grids import Study
+    from ppo_dap.study.store.store import Store
     from ppo_dap.training.run import Run
 
 Row = dict[str, Any]

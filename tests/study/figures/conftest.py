@@ -2,9 +2,9 @@
 
 import pytest
 
-from ppo_dap.study import figure_data
-from ppo_dap.study.cells import Cell
-from ppo_dap.study.grids import Scale
+from ppo_dap.study.figures import data as figure_data
+from ppo_dap.study.store.cells import Cell
+from ppo_dap.study.store.grids import Scale
 from study.figures.figures_drawn import REPS
 
 

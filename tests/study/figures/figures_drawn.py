@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ppo_dap.study.paper_figures import figures_of
-from ppo_dap.study.studies import make_study, only
-from study.levels_made import made_results
+from ppo_dap.study.figures.studies import figures_of
+from ppo_dap.study.store.studies import make_study, only
+from study.figures.levels_made import made_results
 
 REPS = 8
 

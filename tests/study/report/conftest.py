@@ -4,10 +4,10 @@ import functools
 
 import pytest
 
-from ppo_dap.study.compare import compare, overall
-from ppo_dap.study.report import write_report
+from ppo_dap.study.report.page import write_report
+from ppo_dap.study.stats.compare import compare, overall
+from study.report.report_made import make_run
 from study.report.report_read import SWIM, Page
-from study.report_made import make_run
 
 FEW = 100
 
@@ -17,7 +17,7 @@ def few_resamples():
     """Types are checked in each resample: a few do."""
     with pytest.MonkeyPatch.context() as patch:
         for function in (compare, overall):
-            for module in ("compare", "report"):
+            for module in ("stats.compare", "report.page"):
                 patch.setattr(f"ppo_dap.study.{module}.{function.__name__}", functools.partial(function, reps=FEW))
         yield
 

@@ -4,8 +4,8 @@ import json
 from html.parser import HTMLParser
 
 from ppo_dap.cli import main
-from ppo_dap.study.report import write_report
-from study.report_made import make_run
+from ppo_dap.study.report.page import write_report
+from study.report.report_made import make_run
 
 HOSTILE = "<script>alert(1)</script>&\"'"
 

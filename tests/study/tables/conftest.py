@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from ppo_dap.study import effects
-from ppo_dap.study.studies import SMOKE, STUDIES, make_study
+from ppo_dap.study.store.studies import SMOKE, STUDIES, make_study
+from ppo_dap.study.tables import effects
 from study.results_made import Light
 
 

@@ -1,0 +1,1 @@
+"""`ppo-dap bench`: what it all costs."""

@@ -1,0 +1,1 @@
+"""`ppo-dap report`: any set of runs as one page."""
