@@ -24,7 +24,7 @@ def _metrics(iteration, **how):
 
 @pytest.fixture
 def store(tmp_path):
-    """One finished run of four iterations, and one that is still to be made."""
+    """One finished run of five iterations, and one that is still to be made."""
     store = Store(tmp_path / "store")
     done, open_ = (cells.run("Pendulum-v1", "ppo", seed=seed, steps=8000) for seed in (0, 1))
     out = store.out(done)
@@ -37,6 +37,7 @@ def store(tmp_path):
         _metrics(1, ess=2.0),
         _metrics(2, spr=0.5, oglr=0.25, batch_fresh=0.5, pgshare=0.5),
         _metrics(3, ess=math.nan, pgshare=1.0),
+        _metrics(4, ess=None, seconds_iteration=600.0, seconds_env=599.0),  # somebody closed the lid
     ]
     (out / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (out / "evaluations.jsonl").write_text("".join(json.dumps(row) + "\n" for row in EVALUATIONS))
@@ -53,7 +54,7 @@ def test_figures_of_a_run_are_those_of_its_tables(store):
     row = found.runs[done.name]
     assert row["last_return"] == 100.0
     assert row["last_length"] == 30.0
-    # Two iterations after those that compile, of 1 s of environments and 2 s in all.
+    # Two iterations that count after those that compile, of 1 s of environments and 2 s in all.
     assert (row["env_steps"], row["seconds_env"], row["seconds_iteration"]) == (4000, 2.0, 4.0)
     assert row["ess"] == 3.0  # of 2 and 4: None and NaN are no values
     assert (row["spr"], row["oglr"], row["batch_fresh"], row["pgshare"]) == (0.5, 0.25, 0.5, 0.5)

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
+import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +42,8 @@ COUNTS = ("seed", "steps", "env_steps", "state", "guided", "drawn")
 """Columns of whole numbers."""
 SETTLED = 2
 """Iterations in which programs are compiled: their seconds are no part of a run's cost."""
+PAUSE = 3.0
+"""Nor are those of an iteration that took so many times their median: its process or its machine was stopped."""
 
 
 @dataclass
@@ -142,10 +146,7 @@ def _measured(run: Run) -> Row:
     strictly, declared = run.verdict()
     found: Row = {"last_return": evaluations[-1]["return_mean"], "last_length": evaluations[-1]["length_mean"]}
     found["strictly_on_policy"], found["as_declared"] = strictly, declared
-    settled = metrics[SETTLED:]
-    found["env_steps"] = settled[-1]["env_steps"] - metrics[SETTLED - 1]["env_steps"] if settled else 0
-    parts = sorted({name for row in settled for name in row if name.startswith("seconds_")})
-    found |= {name: sum(row.get(name, 0.0) for row in settled) for name in parts}
+    found |= _cost(metrics)
     for name in MEANS:
         values = [row[name] for row in metrics if _number(row.get(name))]
         found[name] = sum(values) / len(values) if values else None
@@ -155,6 +156,17 @@ def _measured(run: Run) -> Row:
         values = [row[name] for row in metrics if _number(row.get(name))]
         found[name] = worst(values) if values else None
     return found
+
+
+def _cost(metrics: list[Row]) -> Row:
+    """Seconds of the iterations that count, in all and by their parts, and their environment steps."""
+    steps = [row["env_steps"] - before["env_steps"] for before, row in itertools.pairwise(metrics)]
+    settled = list(zip(metrics[SETTLED:], steps[SETTLED - 1 :], strict=True))
+    usual = statistics.median(row["seconds_iteration"] for row, _ in settled) if settled else 0.0
+    counted = [(row, taken) for row, taken in settled if row["seconds_iteration"] <= PAUSE * usual]
+    parts = sorted({name for row, _ in counted for name in row if name.startswith("seconds_")})
+    spent = {name: sum(row.get(name, 0.0) for row, _ in counted) for name in parts}
+    return {"env_steps": sum(taken for _, taken in counted)} | spent
 
 
 def _number(value: Any) -> bool:

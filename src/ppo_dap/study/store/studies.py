@@ -195,7 +195,8 @@ def mixed(s: Scale) -> Entries:
     yield from s.early(MIXED, s.ends(parts))
     if not s.brief:
         yield from s.full(MIXED, [TUNED_WARM, BC, *clones])
-        yield from s.early(MIXED, [Arm(m.row, m.name) for m in METHODS.values() if m.name not in ("ppo", "ppo-bc")])
+        others = [Arm(m.row, m.name) for m in METHODS.values() if m.name not in ("ppo", "ppo-bc")]
+        yield from s.early(MIXED, others, s.many)
 
 
 STUDIES: dict[str, Callable[[Scale], Entries]] = {
