@@ -15,9 +15,6 @@ quickstart: .venv/.ready  ## fit a prior on the shipped logs, train PPO and PPO-
 test: lint  ## lint, then run every test
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-smoke: .venv/.ready  ## what takes longer: a tiny version of every study, killed runs, a Ray cluster, a browser
-	$(BIN)/python -m pytest -m smoke tests/study
-
 lint: .venv/.ready  ## style, formatting and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -53,4 +50,4 @@ lock:  ## resolve pyproject.toml into constraints.txt; UPGRADE=--upgrade moves t
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 
-.PHONY: help quickstart test smoke lint sample bench-peers lock
+.PHONY: help quickstart test lint sample bench-peers lock

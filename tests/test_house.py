@@ -6,7 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import pytest
+from jaxtyping import TypeCheckError
+
+from ppo_dap.ppo.gae import gae
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "ppo_dap"
@@ -274,3 +278,12 @@ def test_deviations_name_options_that_exist():
     text = (ROOT / "docs" / "deviations.md").read_text()
     assert unknown_options(text) == set()
     assert unknown_options(text + "`--q-scales none`") == {"q-scales"}
+
+
+def test_shapes_are_checked_in_every_test():
+    step, no = jnp.ones((2, 3)), jnp.zeros((2, 3), bool)
+    assert gae(step, step, step, no, no, ~no, 0.9, 0.9).shape == (2, 3)
+    with pytest.raises(TypeCheckError, match="gae"):
+        gae(step, step[:, :1], step, no, no, ~no, 0.9, 0.9)
+    with pytest.raises(ValueError, match="rank_promotion"):
+        jnp.zeros((2, 3)) + jnp.zeros(3)

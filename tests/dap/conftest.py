@@ -1,6 +1,7 @@
 import pytest
 
-from dap.dap_made import learner_of, quick_stages, small_config, small_frozen
+from dap.dap_made import learner_of, small_config, small_frozen
+from ppo_dap.training.algorithm import Stages
 
 
 @pytest.fixture(scope="session")
@@ -21,4 +22,4 @@ def learner(config):
 @pytest.fixture(scope="session")
 def stages(config):
     """Compiled once; a test that patches what a stage is made of builds its own."""
-    return quick_stages(config)
+    return Stages(config, guided=True)

@@ -18,7 +18,7 @@ from ppo_dap.ppo.update import Normaliser, Settings
 from ppo_dap.prior_config import DiffusionConfig
 from ppo_dap.priors.diffusion import Denoiser
 from ppo_dap.training import algorithm
-from ppo_dap.training.algorithm import Frozen, Schedule, Stages, create_learner
+from ppo_dap.training.algorithm import Frozen, Schedule, create_learner
 from ppo_dap.training.draws import draw, num_parts
 
 OBS, ACT, TIME, ENVS = 3, 2, 16, 4
@@ -144,20 +144,6 @@ def slope_q(slope, width=8, scale=1.0):
 
 def bits(tree):
     return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
-
-
-def quick_jit(function, **options):
-    """`jax.jit` that spends less on optimising what runs once or twice."""
-    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0}, **options)
-
-
-def quick_stages(config):
-    """The stages of a run; those in which no bit is compared are compiled quickly."""
-    stages = Stages(config, guided=True)
-    for name, stage in vars(stages).items():
-        if name not in ("actor", "critic", "seeks_mode"):
-            setattr(stages, name, quick_jit(stage.__wrapped__))
-    return stages
 
 
 def logged(rows, probe):

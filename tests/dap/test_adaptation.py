@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dap.dap_made import ACT, OBS, bits, quick_jit, small_denoiser
+from dap.dap_made import ACT, OBS, bits, small_denoiser
 from ppo_dap.config import AdaptationConfig
 from ppo_dap.dap.adaptation import ADAM, PETData, PETDraws, adapt, steps_until
 from ppo_dap.dap.objective import Batch, provenance
@@ -37,7 +37,7 @@ def pet(states):
     """
     batch = Batch(jnp.asarray(64, jnp.int32), jnp.asarray(states), jnp.asarray(WEIGHTS, jnp.float32))
     config = AdaptationConfig(pet_minibatch_size=16, pet_learning_rate=1e-3)
-    run = quick_jit(partial(adapt, config=config, check=lambda ids, seen: provenance(ids, seen, batch)))
+    run = jax.jit(partial(adapt, config=config, check=lambda ids, seen: provenance(ids, seen, batch)))
 
     def adapted(rows, steps, kind="lora", changed=None):
         start = init_adapters(np.random.default_rng(1), small_denoiser(), kind, 2)
@@ -104,7 +104,7 @@ def test_pet_spr_of_fresh_rows_is_exactly_1_for_a_minibatch_whose_reciprocal_is_
     assert float(jax.jit(jnp.mean)(jnp.ones(41))) != 1  # the planted fault: what it must not be
     start = init_adapters(np.random.default_rng(1), small_denoiser(), "lora", 2)
     draws = PETDraws.make(np.random.default_rng(2), small_denoiser(), 10, config)
-    run = quick_jit(partial(adapt, config=config, check=lambda ids, seen: jnp.ones(len(ids))))
+    run = jax.jit(partial(adapt, config=config, check=lambda ids, seen: jnp.ones(len(ids))))
     assert float(run(small_denoiser(), start, ADAM.init(start), rows, draws, jnp.asarray(1))[2]["pet_spr"]) == 1
 
 

@@ -17,7 +17,6 @@ from dap.dap_made import (
     learner_of,
     logged_rows_for,
     parts_of,
-    quick_stages,
     rollout_of,
     schedule_of,
     small_config,
@@ -26,7 +25,7 @@ from dap.dap_made import (
     with_fault,
 )
 from ppo_dap.dap import audit, guide, objective
-from ppo_dap.training.algorithm import iterate
+from ppo_dap.training.algorithm import Stages, iterate
 from ppo_dap.training.draws import draw
 
 FRESH = "every row of the actor update is of the current batch (share)"
@@ -74,7 +73,7 @@ def test_pgshare_is_ppos_gradient_over_the_actors(learner, frozen, stages, confi
 def test_an_open_gate_shows_in_oglr(learner, frozen, stages, monkeypatch):
     monkeypatch.setattr(objective, "provenance", lambda ids, states, batch: jnp.ones(len(ids)))
     open_stages = copy.copy(stages)
-    open_stages.leakage = quick_stages(small_config()).leakage
+    open_stages.leakage = Stages(small_config(), guided=True).leakage
     (row,) = measured(learner, frozen, open_stages)
     assert violated(audit.measured_claims([row])) == {OGLR}
     assert row["oglr"] == pytest.approx(row["oglr_ungated"], rel=1e-5)
@@ -118,7 +117,7 @@ def test_proposals_for_states_outside_d_on_are_found(learner, frozen, stages, mo
 
     monkeypatch.setattr(guide, "States", half_logged)
     leaking = copy.copy(stages)
-    leaking.propose = quick_stages(small_config()).propose
+    leaking.propose = Stages(small_config(), guided=True).propose
     rows = measured(learner, frozen, leaking)
     assert violated(audit.measured_claims(rows)) == {SPR}
     assert rows[0]["spr"] == 0.5
@@ -132,7 +131,7 @@ def test_logged_rows_in_pet_are_found(learner, frozen, stages):
 
 def test_spr_is_1_when_every_state_gets_proposals(frozen):
     everything = small_config(proposal_fraction=1.0)
-    learner, stages = learner_of(everything), quick_stages(everything)
+    learner, stages = learner_of(everything), Stages(everything, guided=True)
     rollout, draws = rollout_of(learner.ppo.actor), draw(everything, 0, frozen.prior)
     assert not rollout.valid.all()
     parts, critic = parts_of(rollout, everything), learner.ppo.critic

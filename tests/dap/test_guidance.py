@@ -2,13 +2,14 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import softmax
 from scipy.stats import norm
 
-from dap.dap_made import filled, quick_jit, slope_q
+from dap.dap_made import filled, slope_q
 from ppo_dap.config import ProposalConfig
 from ppo_dap.dap.guidance import (
     alpha_schedule,
@@ -100,9 +101,9 @@ def test_drift_is_alpha_times_the_finite_difference_gradient_of_q(own_trunk):
     features, x = NOISE[:, 0, :4], NOISE[..., 4:]
     config = ProposalConfig(guidance_cap=100.0)
     drift = np.asarray(
-        quick_jit(lambda x: q_drift(lambda actions: q(features, actions), 5.0, config)(x, jnp.float32(2.0)))(x)
+        jax.jit(lambda x: q_drift(lambda actions: q(features, actions), 5.0, config)(x, jnp.float32(2.0)))(x)
     )
-    value = quick_jit(lambda x: q(features, x))
+    value = jax.jit(lambda x: q(features, x))
     step = 1e-2
     for d in range(2):
         shift = step * jnp.broadcast_to(jnp.eye(2)[d], x.shape)
@@ -131,8 +132,8 @@ def test_cap_leaves_short_vectors_alone():
     np.testing.assert_allclose(short, [[[0.03, 0.0]]], rtol=1e-6)
 
 
-_farthest = quick_jit(farthest, static_argnums=1)
-_weights = quick_jit(energy_weights)
+_farthest = jax.jit(farthest, static_argnums=1)
+_weights = jax.jit(energy_weights)
 
 
 def greedy(points, num):

@@ -2,12 +2,13 @@
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from dap.dap_made import ACT, OBS, bits, changed, filled, learner_of, quick_jit, small_config
+from dap.dap_made import ACT, OBS, bits, changed, filled, learner_of, small_config
 from ppo_dap.dap.calibration import Calibration
 from ppo_dap.dap.guide import Judged, OnPolicy, learn_q, recalibrated
 from ppo_dap.nets.critic import Critic
@@ -51,7 +52,7 @@ def q_values(q, critic):
 
 def learned_on(**options):
     guide, config = guide_of(**options)
-    stage = quick_jit(partial(learn_q, config=config))
+    stage = jax.jit(partial(learn_q, config=config))
     orders = draw_orders(np.random.default_rng(1), EPOCHS, ROWS)
     return guide, stage(guide, NEW, OLD, fresh_rows(), orders)
 
@@ -87,7 +88,7 @@ def test_q_is_judged_before_it_learns_from_the_rows(learned):
 
 def test_rows_of_another_ppo_have_no_advantages_to_judge_by():
     guide, config = guide_of(q_epochs=1)
-    stage = quick_jit(partial(learn_q, config=config))
+    stage = jax.jit(partial(learn_q, config=config))
     rows, orders = (
         fresh_rows(advantages=None, returns=None),
         jnp.asarray(draw_orders(np.random.default_rng(1), 1, ROWS)),

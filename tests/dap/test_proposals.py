@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from dap.dap_made import OBS, bits, quick_jit, slope_q, small_denoiser
+from dap.dap_made import OBS, bits, slope_q, small_denoiser
 from ppo_dap.config import ProposalConfig
 from ppo_dap.dap.proposals import (
     ProposalDraws,
@@ -30,7 +30,7 @@ Q = slope_q(SLOPE)
 
 
 N = 256
-_propose = quick_jit(propose, static_argnames="config")
+_propose = jax.jit(propose, static_argnames="config")
 
 
 def states(raw):
@@ -248,7 +248,7 @@ def test_no_gradient_of_a_proposal_reaches_the_prior(monkeypatch):
             proposals, metrics = propose(proposer(*prior), given, draws, jnp.float32(1), config=config)
             return jnp.sum(proposals.actions**3 + proposals.proxy_std[:, None]) + metrics["ess"]
 
-        return [np.any([np.any(x) for x in jax.tree.leaves(part)]) for part in quick_jit(jax.grad(total))(prior)]
+        return [np.any([np.any(x) for x in jax.tree.leaves(part)]) for part in jax.jit(jax.grad(total))(prior)]
 
     prior = (small_denoiser(), adapters)
     assert gradients() == [False, False]

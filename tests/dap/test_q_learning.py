@@ -2,12 +2,13 @@
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from dap.dap_made import bits, changed, filled, quick_jit
+from dap.dap_made import bits, changed, filled
 from ppo_dap.config import QConfig
 from ppo_dap.dap.q_learning import ADAM, QData, fit_q, rank_correlation, trainable
 from ppo_dap.nets.critic import Critic, QFunction, q_features
@@ -42,7 +43,7 @@ def fit(critic):
     def run(rows, trunk):
         config = QConfig(q_trunk=trunk, q_epochs=150, q_learning_rate=1e-2, q_hidden_size=16)
         q = filled(lambda rng: QFunction.create(rng, 2, 1, 8, 16, trunk == "separate"), 2)
-        compiled.setdefault(trunk, quick_jit(partial(fit_q, minibatch_size=64, config=config)))
+        compiled.setdefault(trunk, jax.jit(partial(fit_q, minibatch_size=64, config=config)))
         orders = draw_orders(np.random.default_rng(3), config.q_epochs, ROWS)
         return compiled[trunk](q, critic, ADAM.init(trainable(q, critic, config)), rows, orders)
 
@@ -81,7 +82,7 @@ def test_rows_without_weight_teach_nothing(fit, rows):
     assert bits(clean) != bits(counted)
 
 
-ranked = quick_jit(rank_correlation)
+ranked = jax.jit(rank_correlation)
 
 
 def correlation(x, y, weights=None):

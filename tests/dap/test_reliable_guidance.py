@@ -45,6 +45,7 @@ def test_a_q_that_ranks_no_better_than_chance_does_not_guide(rank):
     assert gaps.max() < 1e-6
 
 
+@pytest.mark.as_shipped
 def test_a_q_that_ranks_perfectly_guides_as_without_a_gate():
     open_gate, ungated = gated(1.0), made(q_scale="none", sampler_steps=2)
     assert bits(open_gate) == bits(ungated)

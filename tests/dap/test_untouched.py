@@ -9,6 +9,8 @@ import pytest
 from dap.dap_made import bits, iterated, learner_of, rollout_of, schedule_of
 from ppo_dap.training.algorithm import Stages, iterate
 
+pytestmark = pytest.mark.as_shipped
+
 ITERATIONS = 5
 
 

@@ -201,6 +201,7 @@ def differ(first, second):
     return any(np.any(a != b) for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True))
 
 
+@pytest.mark.as_shipped
 def test_slope_0_is_ppo_bit_for_bit():
     ppo = improved()
     assert_same_bits(improved(surrogate="generalised_clip", clip_slope=0.0), ppo)
@@ -228,6 +229,7 @@ def far_rows():
     )
 
 
+@pytest.mark.as_shipped
 def test_a_boundless_trust_region_is_ppo_without_a_clip_bit_for_bit():
     rows = far_rows()
     free = improved(rows, clip_epsilon=1e6)

@@ -162,6 +162,7 @@ def test_drift_sees_the_sample_before_the_step():
     assert float(displacement[0, 0]) == pytest.approx(0.2)
 
 
+@pytest.mark.as_shipped
 @pytest.mark.parametrize("sampler", [ancestral, dpmpp_2m])
 def test_displacement_cap(sampler):
     noise = jax.random.normal(jax.random.key(0), (11, 3, 4, 2))

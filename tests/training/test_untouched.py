@@ -6,6 +6,8 @@ from safetensors.numpy import load_file
 import ppo_dap
 from ppo_dap.training.collect import collect_logs
 
+pytestmark = pytest.mark.as_shipped
+
 STEPS = 20 * 2048 - 1000
 
 

@@ -83,6 +83,7 @@ def test_a_run_that_reuses_a_batch_says_so_and_resumes_with_the_same_bits(tmp_pa
     assert_same(tmp_path / "run", tmp_path / "whole")
 
 
+@pytest.mark.as_shipped
 def test_a_run_whose_old_batches_never_win_is_ppo_bit_for_bit(tmp_path, monkeypatch):
     """Every contest is a draw, and a draw is PPO's: the second candidate, its orders and its batch leave no trace."""
     monkeypatch.setattr(reuse, "score", lambda *arguments: (jnp.float32(0), jnp.float32(0)))

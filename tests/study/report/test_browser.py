@@ -11,10 +11,9 @@ from study.report.browser import Page, find_chromium
 from study.report.report_made import make_run
 
 CHROMIUM = find_chromium()
-pytestmark = [
-    pytest.mark.smoke,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium found: put one on the PATH, or name it in CHROMIUM"),
-]
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium found: put one on the PATH, or name it in CHROMIUM"
+)
 LABELS = ["ppo (tuned)", "ppo", "ppo-dap"]
 FIRST = "document.querySelector('.curves')"
 LEGEND = f"{FIRST}.querySelector('.legend')"

@@ -25,8 +25,6 @@ from ppo_dap.study.store.store import open_store
 from ppo_dap.study.store.studies import STUDIES
 from study.store.store_made import COMMAND, base, contents, made, small_grid, study, supervisor
 
-pytestmark = pytest.mark.smoke
-
 GRID = small_grid(runs=2, slow=0.15)
 PYTHON = sys.executable
 

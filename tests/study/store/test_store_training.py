@@ -8,13 +8,9 @@ import sys
 import threading
 import time
 
-import pytest
-
 from ppo_dap.study.store import cells
 from ppo_dap.study.store.store import Store
 from study.store.store_made import study, supervisor
-
-pytestmark = pytest.mark.smoke
 
 OPTIONS = {
     "num_envs": 4, "rollout_steps": 128, "minibatch_size": 64, "num_epochs": 2, "eval_every": 512, "eval_episodes": 1,
