@@ -26,7 +26,22 @@ WHOLE = TUNED_WARM.name
 
 def mixed(results: Results, study: Study) -> Table:
     """All arms; `tuned-warm` against each clone; and its difference to itself without each part."""
-    runs = view(results, study, "mixed", "early")
+    title, runs = "Logs of several gaits", view(results, study, "mixed", "early")
+    views = [runs]
+    records = _records(runs)
+    more = [_clones(runs, study.epochs), _parts(runs, study.epochs)] if records else []
+    if any((entry.labels["study"], entry.labels["part"]) == ("mixed", "full") for entry in study.entries):
+        long = view(results, study, "mixed", "full")
+        views.append(long)
+        which = f", runs of {long.steps:,} steps"
+        more += [listed(title + which, _records(long), _columns(long, study.epochs), words=3)]
+        more += [_clones(long, study.epochs, which)]
+    notes = [READ, WALL, "The paper has no such logs."]
+    return listed(title, records, _columns(runs, study.epochs), notes, 3, made_by(study, *views), more)
+
+
+def _records(runs: View) -> list[Row]:
+    """Each arm on each task, as far as it has been run."""
     metrics = ["alc", "last_return", "seconds_per_step"]
     found, records = runs.effects(PPO.name, metrics), []
     for task, logs in runs.settings:
@@ -35,22 +50,21 @@ def mixed(results: Results, study: Study) -> Table:
                 record = {"task": task, "logs": logs, "method": arm, "preset": labels["preset"], "n": len(own)}
                 record |= {metric: found[metric, task, arm] for metric in metrics}
                 records.append(record | {"audit": verdict(own)})
-    columns: Columns = {
+    return records
+
+
+def _columns(runs: View, epochs: float) -> Columns:
+    ppo: Columns = {"wall-clock x PPO": lambda row: ratio_text(row["seconds_per_step"], row["n"])}
+    return {
         "task": lambda row: row["task"],
         "method": lambda row: row["method"],
         "preset": lambda row: row["preset"],
         "n": lambda row: str(row["n"]),
-        f"ALC@{study.epochs:g}": lambda row: mean_text(row["alc"], of=row["n"]),
+        f"ALC@{epochs:g}": lambda row: mean_text(row["alc"], of=row["n"]),
         f"return after {runs.steps:,} steps": lambda row: mean_text(row["last_return"], of=row["n"]),
-        "wall-clock x PPO": lambda row: ratio_text(row["seconds_per_step"], row["n"]),
+        **(ppo if PPO.name in runs.arms else {}),
         "audit": lambda row: row["audit"],
     }
-    notes = [READ, WALL, "The paper has no such logs."]
-    more = [_clones(runs, study.epochs), _parts(runs, study.epochs)] if records else []
-    if any((entry.labels["study"], entry.labels["part"]) == ("mixed", "full") for entry in study.entries):
-        long = view(results, study, "mixed", "full")
-        more.append(_clones(long, study.epochs, f", runs of {long.steps:,} steps"))
-    return listed("Logs of several gaits", records, columns, notes, 3, made_by(study, runs), more)
 
 
 def _clones(runs: View, epochs: float, which: str = "") -> Table:
