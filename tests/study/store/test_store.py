@@ -230,10 +230,16 @@ def test_a_failure_that_cannot_be_noted_is_still_told(tmp_path, capsys):
         Store.attempts = before
 
 
-def test_ctrl_c_ends_the_workers_and_frees_their_cells(tmp_path, capsys):
+@pytest.mark.parametrize("ignored", [False, True])
+def test_ctrl_c_ends_the_workers_and_frees_their_cells(tmp_path, capsys, ignored):
     cell = base(slow=60.0)
     one = supervisor(tmp_path, study(cell))
-    one._start_some()
+    # What a script starts in its background ignores the signal, and so does what that starts.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+    try:
+        one._start_some()
+    finally:
+        signal.signal(signal.SIGINT, before)
     while not (one.store.out(cell) / "table").exists():  # its claim is there before it is ready to note anything
         time.sleep(0.02)
     one._stop()

@@ -10,6 +10,7 @@ import json
 import os
 import resource
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -188,6 +189,8 @@ def main(arguments: Sequence[str] | None = None, make: Make = make_cell, beat: f
     parser.add_argument("cell")
     parser.add_argument("claim", type=int)
     options = parser.parse_args(arguments)
+    # It is how we are asked to stop, and what a script starts in its background begins with it ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return work(Store(options.store), options.cell, options.claim, make, beat)
     except OSError as error:
