@@ -26,10 +26,3 @@ install_import_hook("ppo_dap", "beartype.beartype")
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 mujoco.set_mju_user_warning(lambda text: None)  # else every warning is appended to MUJOCO_LOG.TXT in the working folder
-
-FIRST = ("study/test_smoke.py", "test_as_shipped.py")
-"""Files that take minutes, most of them in processes of their own: they begin first, and others go on beside them."""
-
-
-def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: not str(item.path).endswith(FIRST))
