@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from ppo_dap.errors import InputError
 from ppo_dap.storage import write_atomically
-from ppo_dap.study.stats.measures import EPOCH, alc
+from ppo_dap.study.stats.measures import COMPILED_AFTER, EPOCH, alc
 
 if TYPE_CHECKING:
     from ppo_dap.study.store.cells import Cell
@@ -40,10 +40,8 @@ WORDS = ("cell", "of", "task", "logs", "method", "preset", "options")
 """Columns whose values are no numbers, whatever they look like."""
 COUNTS = ("seed", "steps", "env_steps", "state", "guided", "drawn")
 """Columns of whole numbers."""
-SETTLED = 2
-"""Iterations in which programs are compiled: their seconds are no part of a run's cost."""
 PAUSE = 3.0
-"""Nor are those of an iteration that took so many times their median: its process or its machine was stopped."""
+"""An iteration that took so many times the median is no part of a run's cost: its process or machine was stopped."""
 
 
 @dataclass
@@ -161,7 +159,7 @@ def _measured(run: Run) -> Row:
 def _cost(metrics: list[Row]) -> Row:
     """Seconds of the iterations that count, in all and by their parts, and their environment steps."""
     steps = [row["env_steps"] - before["env_steps"] for before, row in itertools.pairwise(metrics)]
-    settled = list(zip(metrics[SETTLED:], steps[SETTLED - 1 :], strict=True))
+    settled = list(zip(metrics[COMPILED_AFTER:], steps[COMPILED_AFTER - 1 :], strict=True))
     usual = statistics.median(row["seconds_iteration"] for row, _ in settled) if settled else 0.0
     counted = [(row, taken) for row, taken in settled if row["seconds_iteration"] <= PAUSE * usual]
     parts = sorted({name for row, _ in counted for name in row if name.startswith("seconds_")})

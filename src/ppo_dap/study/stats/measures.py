@@ -16,6 +16,8 @@ from jaxtyping import Float
 from ppo_dap.errors import InputError
 from ppo_dap.tasks.catalogue import CATALOGUE, NAMESPACED
 
+COMPILED_AFTER = 2
+"""Iterations in which programs are compiled; they do not count as cost."""
 EPOCH = 5_000
 """Environment steps of one epoch (5.1.1)."""
 REPS = 2_000

@@ -8,12 +8,9 @@ from typing import Any
 
 from ppo_dap import config as configs
 from ppo_dap.methods import get_method, resolve
-from ppo_dap.study.stats.measures import EPOCH, alc
+from ppo_dap.study.stats.measures import COMPILED_AFTER, EPOCH, alc
 from ppo_dap.tasks import CATALOGUE
 from ppo_dap.training.run import Run
-
-COMPILED_AFTER = 2
-"""Iterations in which programs are compiled; they do not count as cost."""
 
 AROUND = {field.name for field in dataclasses.fields(configs.RunConfig)} - {"checkpoint_every"}
 """Settings that do not tell one method from another; where environments restart does."""
