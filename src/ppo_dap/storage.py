@@ -71,7 +71,7 @@ def tree_from_tensors(like: Any, tensors: Mapping[str, np.ndarray], prefix: str,
         if name not in tensors or tensors[name].shape != leaf.shape:
             found = tensors[name].shape if name in tensors else "nothing"
             raise InputError(f"{source} has {found} for {name} where {leaf.shape} is needed: was it another config?")
-        loaded.append(jax.numpy.asarray(tensors[name]))
+        loaded.append(jax.device_put(tensors[name]))
     return jax.tree.unflatten(jax.tree.structure(like), loaded)
 
 

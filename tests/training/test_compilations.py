@@ -1,9 +1,12 @@
-"""After the second iteration nothing is compiled any more: not by schedules, checkpoints, evaluations or their ends."""
+"""Nothing is compiled for networks, nor after the second iteration: not by schedules, checkpoints or evaluations."""
 
 import jax
 import pytest
 
 import ppo_dap
+from ppo_dap import config as configs
+from ppo_dap.priors import load_prior
+from ppo_dap.training.algorithm import create_learner
 from ppo_dap.training.recording import Recorder
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -42,3 +45,12 @@ def test_nothing_is_compiled_after_the_second_iteration(
     assert counts[1] == counts[-1]
     jax.jit(lambda x: x * 1.2345)(2.0)
     assert len(compilations) > counts[-1]  # and would have heard more
+
+
+def test_networks_and_their_optimizers_begin_without_a_program(hopper_prior, compilations):
+    config = configs.make("tuned", hidden_size=48, q_hidden_size=40, adapter_rank=3, q_calibration="affine")
+    learner = create_learner((11, 3), config, load_prior(hopper_prior).network)
+    assert learner.guide.adapters is not None
+    assert not compilations
+    jax.jit(lambda x: x * 2.3456)(2.0)
+    assert compilations

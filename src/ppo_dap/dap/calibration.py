@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ppo_dap.nets.arrays import on_device
+
 KNOTS = 16
 
 
@@ -20,7 +22,7 @@ class Calibration(NamedTuple):
     @staticmethod
     def identity() -> Calibration:
         """Changes nothing."""
-        line = jnp.asarray(np.linspace(-1.0, 1.0, KNOTS, dtype=np.float32))
+        line = on_device(np.linspace(-1.0, 1.0, KNOTS))
         return Calibration(line, line)
 
     def __call__(self, q: Float[Array, "n k"]) -> Float[Array, "n k"]:
@@ -62,4 +64,4 @@ def calibrate(
         values = max(slope, 0.0) * knots + (offset if slope > 0 else returns.mean())
     else:
         values = np.interp(knots, *isotonic_points(q, returns))
-    return Calibration(jnp.asarray(knots, jnp.float32), jnp.asarray(values, jnp.float32))
+    return Calibration(on_device(knots), on_device(values))

@@ -20,6 +20,7 @@ from ppo_dap.dap.objective import Batch, GatedProposals, admit_proposals, proven
 from ppo_dap.dap.proposals import ProposalDraws, Proposals, Proposer, States, choose_states, propose
 from ppo_dap.nets.actor import Actor
 from ppo_dap.nets.adapters import Adapters, Backbone, adapter_norm, init_adapters
+from ppo_dap.nets.arrays import first_state, on_device
 from ppo_dap.nets.critic import Critic, QFunction, q_features
 from ppo_dap.ppo.surrogate import share
 from ppo_dap.ppo.update import Rows
@@ -127,15 +128,15 @@ def create_guide(
     adapters = None
     if adaptation.is_tuned(prior, config.adaptation) and isinstance(prior, Backbone):
         adapters = init_adapters(rng, prior, config.adaptation.adapter, config.adaptation.adapter_rank)
-    blank = Judged(*jnp.asarray(np.zeros((3, config.ppo.rollout_steps), np.float32)))
+    blank = Judged(*(on_device(np.zeros(config.ppo.rollout_steps)) for _ in Judged._fields))
     return GuideState(
         q,
-        q_learning.ADAM.init(q_learning.trainable(q, critic, config.q)),
-        jnp.asarray(np.float32(1)),
-        jnp.asarray(np.float32(0)),
+        first_state(q_learning.ADAM, q_learning.trainable(q, critic, config.q)),
+        on_device(1),
+        on_device(0),
         *((None, None) if config.q.q_calibration == "none" else (Calibration.identity(), blank)),
         adapters,
-        () if adapters is None else adaptation.ADAM.init(adapters),
+        () if adapters is None else first_state(adaptation.ADAM, adapters),
     )
 
 

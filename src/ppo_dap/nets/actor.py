@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ppo_dap.nets.arrays import on_device
 from ppo_dap.nets.mlp import MLP
 
 
@@ -23,7 +24,7 @@ class Actor(eqx.Module):
     def create(rng: np.random.Generator, observation_size: int, action_size: int, hidden_size: int) -> Actor:
         """Orthogonal start, gain 0.01 on the mean head, standard deviation 1."""
         sizes = (observation_size, hidden_size, hidden_size, action_size)
-        return Actor(MLP.create(rng, sizes, "tanh", final_gain=0.01), jnp.asarray(np.zeros(action_size, np.float32)))
+        return Actor(MLP.create(rng, sizes, "tanh", final_gain=0.01), on_device(np.zeros(action_size)))
 
     def __call__(self, observations: Float[Array, "n obs"]) -> Float[Array, "n act"]:
         """Means at normalised observations."""

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ppo_dap.errors import unknown
+from ppo_dap.nets.arrays import on_device
 from ppo_dap.nets.mlp import Linear, silu
 
 AdapterKind = Literal["lora", "bottleneck"]
@@ -73,7 +74,7 @@ def _init_one(rng: np.random.Generator, layer: Linear, kind: str, rank: int) -> 
     out_size, in_size = layer.weight.shape
     width = in_size if kind == "lora" else out_size
     down = rng.standard_normal((rank, width)) / width**0.5
-    return _KINDS[kind](jnp.asarray(down, jnp.float32), jnp.asarray(np.zeros((out_size, rank), np.float32)))
+    return _KINDS[kind](on_device(down), on_device(np.zeros((out_size, rank))))
 
 
 def apply_hidden(

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ppo_dap.nets.arrays import on_device
+
 Activation = Literal["tanh", "silu"]
 
 
@@ -46,8 +48,7 @@ class Linear(eqx.Module):
 
 
 def _linear(weight: np.ndarray) -> Linear:
-    # Networks start on the host: as XLA programs their first numbers would take seconds to compile.
-    return Linear(jnp.asarray(weight, jnp.float32), jnp.asarray(np.zeros(len(weight), np.float32)))
+    return Linear(on_device(weight), on_device(np.zeros(len(weight))))
 
 
 class MLP(eqx.Module):

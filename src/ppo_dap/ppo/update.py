@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ppo_dap.config import PPOConfig
 from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
+from ppo_dap.nets.arrays import first_state
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.gae import gae
 from ppo_dap.ppo.rollout import Rollout
@@ -51,7 +52,7 @@ class PPOState(eqx.Module):
         """Fresh networks."""
         actor = Actor.create(rng, observation_size, action_size, hidden_size)
         critic = Critic.create(rng, observation_size, hidden_size)
-        return PPOState(actor, critic, ADAM.init(actor), ADAM.init(critic))
+        return PPOState(actor, critic, first_state(ADAM, actor), first_state(ADAM, critic))
 
 
 class Rows(eqx.Module):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ppo_dap.config import Config
@@ -13,6 +12,7 @@ from ppo_dap.dap import audit
 from ppo_dap.dap.dataflow import trace
 from ppo_dap.dap.guide import GuideState
 from ppo_dap.dap.objective import Weights
+from ppo_dap.nets.arrays import on_device
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import Normaliser, PPOState, Settings
 from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, adds, call, iterate
@@ -86,7 +86,7 @@ def example_rollout(config: Config, observation_size: int, action_size: int) -> 
 
 def example_schedule(config: Config, guided: bool) -> Schedule:
     """A schedule of zeros, for tracing."""
-    zero, none = jnp.asarray(np.float32(0)), jnp.asarray(np.int32(0))
+    zero, none = on_device(0), on_device(0, np.int32)
     added = adds(config, guided)
-    settings = Settings(zero, zero, jnp.asarray(added), Weights(zero, zero, zero) if added else ())
+    settings = Settings(zero, zero, on_device(added, bool), Weights(zero, zero, zero) if added else ())
     return Schedule(none, settings, zero, none)

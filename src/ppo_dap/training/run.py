@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +18,7 @@ from ppo_dap.errors import InputError
 from ppo_dap.logs import Logs, load_logs, require_compatible
 from ppo_dap.logs.check import family
 from ppo_dap.methods import Method, get_method, resolve
+from ppo_dap.nets.arrays import on_device
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy, load_policy
 from ppo_dap.priors import Prior, load_prior, random_prior
@@ -157,8 +157,8 @@ def _make_trainer(
     sizes = (spec.observation_size, spec.action_size)
     frozen = None
     if prior is not None:
-        probe = audit.Probe(jnp.asarray(prior.probe_observations), jnp.asarray(prior.probe_actions))
-        frozen = Frozen(prior.network, jnp.asarray(condition), probe)
+        probe = audit.Probe(on_device(prior.probe_observations), on_device(prior.probe_actions))
+        frozen = Frozen(prior.network, on_device(condition), probe)
     learner = create_learner(sizes, config, None if frozen is None else frozen.prior)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
     lines = None

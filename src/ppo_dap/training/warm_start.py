@@ -16,6 +16,7 @@ from ppo_dap.config import Config
 from ppo_dap.errors import InputError
 from ppo_dap.logs import Logs, best_episodes
 from ppo_dap.nets.actor import Actor, log_prob
+from ppo_dap.nets.arrays import on_device
 from ppo_dap.nets.critic import Critic, q_features
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import scale_actions
@@ -52,7 +53,7 @@ def warm_start(state: TrainState, logs: Logs, spec: TaskSpec, config: Config) ->
     for part, source in ((train, 0), (held_out, 1)):
         returns = logs.split(seed=config.run.seed)[source].returns_to_go(config.ppo.gamma)
         assert returns is not None  # _reward_scale has checked
-        part["returns"] = jnp.asarray(returns / reward_scale.std)
+        part["returns"] = on_device(returns / reward_scale.std)
     if start.warm_start == "actor_critic":
         critic = _fit(learner.ppo.critic, _critic_loss, train, held_out, config)
         learner = eqx.tree_at(lambda s: s.ppo.critic, learner, critic)
@@ -68,7 +69,7 @@ def _data(logs: Logs, moments: RunningMoments, spec: TaskSpec, config: Config) -
     clip = config.ppo.observation_clip
     observations = np.clip((logs.observations - moments.mean) / moments.std, -clip, clip)
     actions = np.clip(scale_actions(logs.actions, spec.action_low, spec.action_high), -1, 1)
-    return {"observations": jnp.asarray(observations, jnp.float32), "actions": jnp.asarray(actions, jnp.float32)}
+    return {"observations": on_device(observations), "actions": on_device(actions)}
 
 
 def _reward_scale(logs: Logs, config: Config) -> RewardScale:

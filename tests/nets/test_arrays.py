@@ -1,0 +1,25 @@
+"""Arrays of the device from numbers of the host, without a program for each shape."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from ppo_dap.nets.arrays import first_state, on_device
+
+
+def test_values_and_type_are_those_of_jax_numpy():
+    values = np.arange(6.0).reshape(2, 3) / 7
+    assert on_device(values).dtype == jnp.float32
+    np.testing.assert_array_equal(on_device(values), jnp.asarray(values, jnp.float32))
+    assert on_device(3, np.int32).shape == ()
+    assert not on_device(1).weak_type  # else a stage would be compiled again for the array that comes after it
+
+
+def test_first_state_is_the_optimizers_own():
+    params = {"weight": on_device(np.ones((3, 2))), "bias": on_device(np.ones(3))}
+    own, ours = optax.scale_by_adam().init(params), first_state(optax.scale_by_adam(), params)
+    assert jax.tree.structure(own) == jax.tree.structure(ours)
+    for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(ours), strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert (a.dtype, a.weak_type) == (b.dtype, b.weak_type)
