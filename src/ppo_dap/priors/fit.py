@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from ppo_dap.errors import InputError, TrainingDiverged, unknown
 from ppo_dap.logs.dataset import Logs
+from ppo_dap.nets.arrays import first_state, on_device
 from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 from ppo_dap.priors.kinds import NETWORKS
 from ppo_dap.priors.network import Rows, TrainedNetwork
@@ -128,7 +129,7 @@ def _rows(logs: Logs, low: np.ndarray, high: np.ndarray, asks: Mapping[str, floa
     condition = np.zeros((observations.shape[0], 0), np.float32)
     if asks:
         condition = asked_return(row_returns(logs), asks)
-    return Rows(*(jnp.asarray(a) for a in (observations, condition, actions)))
+    return Rows(*(on_device(a) for a in (observations, condition, actions)))
 
 
 def train_network(
@@ -149,7 +150,7 @@ def train_network(
     state = init_state(network_class, train, config, rng)
     # A fixed random subset, in random order and with the same noise at every look: looks differ by the weights alone.
     picked = rng.permutation(held_out.actions.shape[0])[:VALIDATION_ROWS]
-    held_out = Rows(*(a[picked] for a in held_out))
+    held_out = Rows(*(on_device(np.asarray(a)[picked]) for a in held_out))
     held_out_draws = state.network.draw_loss(rng, len(picked))
     size = (config.chunk_steps, config.batch_size)
     best, best_loss, best_step, step, train_loss = state.ema, float("inf"), 0, 0, float("nan")
@@ -194,12 +195,12 @@ def init_state(network_class: Any, rows: Rows, config: Any, rng: np.random.Gener
     network = network_class.create(
         rng,
         config,
-        jnp.asarray(mean, jnp.float32),
-        jnp.asarray(np.where(std > 1e-6, std, 1.0), jnp.float32),
-        jnp.asarray(spread, jnp.float32),
+        on_device(mean),
+        on_device(np.where(std > 1e-6, std, 1.0)),
+        on_device(spread),
         rows.actions.shape[1],
     )
-    return FitState(network, network, _optimizer(config).init(network), jnp.zeros((), jnp.int32))
+    return FitState(network, network, first_state(_optimizer(config), network), on_device(0, np.int32))
 
 
 def _moments(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "2 columns"]:
