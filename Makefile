@@ -13,7 +13,7 @@ quickstart: .venv/.ready  ## fit a prior on the shipped logs, train PPO and PPO-
 	$(BIN)/ppo-dap quickstart
 
 test: lint  ## lint, then run every test
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 lint: .venv/.ready  ## style, formatting and types
 	$(BIN)/ruff check .

@@ -26,3 +26,10 @@ install_import_hook("ppo_dap", "beartype.beartype")
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 mujoco.set_mju_user_warning(lambda text: None)  # else every warning is appended to MUJOCO_LOG.TXT in the working folder
+
+LONGEST = ("test_smoke.py", "test_ray.py", "test_as_shipped.py")
+
+
+def pytest_collection_modifyitems(items):
+    """What takes minutes begins first: at the end one core would work through it and the other wait."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
