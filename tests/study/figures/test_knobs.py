@@ -1,5 +1,7 @@
 """Figs 9, 10 and 12, and coverage: what a knob changes."""
 
+import statistics
+
 import numpy as np
 import pytest
 
@@ -17,8 +19,9 @@ def test_fig_9_goes_from_the_smallest_value_to_the_largest():
         assert y == pytest.approx([columns(rows, arm, "alc", "Walker2d-v5").mean() / base - 1 for arm in arms])
         assert np.diff(x) == pytest.approx([1, 1, 1])
         assert [text.get_text() for text in axes[panel].get_xticklabels()] == [arm.partition("=")[2] for arm in arms]
-    seconds = [columns(rows, arm, "seconds_iteration", "Hopper-v5").sum() for arm in ("K=20 (tuned)", "PPO")]
-    assert line(axes[4], "Hopper medium-expert, tuned").get_ydata()[-1] == pytest.approx(seconds[0] / seconds[1])
+    seconds = [columns(rows, arm, "seconds_iteration", "Hopper-v5") for arm in ("K=20 (tuned)", "PPO")]
+    ratio = statistics.median(seconds[0] / seconds[1])
+    assert line(axes[4], "Hopper medium-expert, tuned").get_ydata()[-1] == pytest.approx(ratio)
 
 
 def test_fig_10_shows_every_run_and_boxes_of_five_or_more():

@@ -12,6 +12,7 @@ from ppo_dap.study.stats.measures import (
     interquartile_mean,
     mean_interval,
     mean_relative_change,
+    median_ratio,
     normalised_score,
     normalised_tasks,
     probability_of_improvement,
@@ -161,6 +162,28 @@ def test_interval_of_the_probability_of_improvement():
     x, y = draws(60), draws(60, seed=4)
     found = probability_of_improvement({"t": x}, {"t": y})
     assert found.high - found.low == pytest.approx(2 * 1.96 * math.sqrt(121 / (12 * 3600)), rel=0.1)
+
+
+def test_median_ratio_is_of_pairs_and_outlives_one_run_that_had_to_wait():
+    found = median_ratio([11.0, 24.0, 900.0], [10.0, 20.0, 30.0])
+    # Of three, 7 of the 27 resamples have the lowest as their median, 7 the highest.
+    assert found == pytest.approx((1.2, 1.1, 30.0))
+
+
+def test_median_ratio_against_scipy():
+    x, y = np.exp(draws(2, 9))
+    low, high = stats.bootstrap(
+        (x / y,), np.median, method="percentile", n_resamples=20_000, rng=np.random.default_rng(3)
+    ).confidence_interval
+    found = median_ratio(x, y, reps=20_000)
+    assert found.value == np.median(x / y)
+    assert found[1:] == pytest.approx((low, high), rel=0.02)
+
+
+def test_median_ratio_over_what_is_not_above_zero_is_none():
+    assert np.isnan(median_ratio([1.0, 2], [1.0, 0])).all()
+    with pytest.raises(InputError, match="2 and 3 runs"):
+        median_ratio([1.0, 2], [1.0, 2, 3])
 
 
 def test_relative_change_of_negative_returns():

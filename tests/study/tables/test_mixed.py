@@ -22,8 +22,10 @@ def mixed_numbers(labels):
         return {"alc": base - 10 - seed**2, "last_return": base + (-1) ** seed * (5 + seed)}
     if arm == f"{WARM}: no guidance":
         return {"alc": base - [10, 20, 60][seed], "last_return": base + 4}
-    if arm == "PPO-DAP (Ours)" and seed == 0:
-        return {"strictly_on_policy": False, "as_declared": False}
+    if arm == "PPO-DAP (Ours)":
+        return {"alc": 300.0 + seed} | ({"strictly_on_policy": False, "as_declared": False} if seed == 0 else {})
+    if arm == "PPO + Flow-prior" and seed < 7:
+        return {"alc": 400.0 - seed}
     if arm == "PPO-DAP (No-VG)" and seed < 2:
         return {"strictly_on_policy": bool(seed), "as_declared": bool(seed)}
     if arm == "PPO-ARC":
@@ -38,7 +40,7 @@ def mixed(studies):
 
 def test_a_violated_audit_is_shown_as_such(mixed):
     audits = {key[2]: line["audit"] for key, line in body(mixed).items() if key[0] == "Logs of several gaits"}
-    assert audits["PPO-DAP (Ours)"] == "VIOLATED"
+    assert audits["PPO-DAP (Ours)"] == "VIOLATED: 1 of 8"
     assert audits["PPO-DAP (No-VG)"] == "VIOLATED: 1 of 2"  # one that holds does not outvote it
     assert audits["PPO-ARC"] == "not, as declared"
     assert audits[WARM] == "strictly on-policy"
@@ -61,6 +63,20 @@ def test_the_whole_against_a_clone(mixed):
     p = stats.wilcoxon(-((-1.0) ** seeds) * (5 + seeds), method="exact").pvalue
     assert last["p"] == f"{p:.2g}"
     assert {key[1] for key in body(mixed) if key[0] == title} == {"PPO + BC", "PPO"}
+
+
+def test_the_paper_s_settings_against_the_other_methods(mixed):
+    lines = {key: line for key, line in body(mixed).items() if key[0].startswith("PPO-DAP (Ours) with the paper's")}
+    assert {key[1] for key in lines} == {
+        "PPO",
+        "PPO + Flow-prior",
+        "PPO-DAP (No-VG)",
+        "PPO-ARC",
+    }  # those that have runs
+    (of,) = (line for key, line in lines.items() if key[1] == "PPO + Flow-prior")
+    x, y = 300 + np.arange(7), 400 - np.arange(7)
+    assert (of["pairs"], of["p"]) == ("7", f"{stats.wilcoxon(x, y, method='exact').pvalue:.2g}")
+    assert of["change"].startswith(f"{x.mean() / y.mean() - 1:+.0%}")
 
 
 def test_what_a_part_is_worth_is_a_paired_difference(mixed):

@@ -16,6 +16,7 @@ from ppo_dap.study.stats.measures import (
     REPS,
     interquartile_means,
     mean_interval,
+    median_ratio,
     normalised_score,
     normalised_tasks,
     probability_of_improvement,
@@ -35,11 +36,12 @@ def compare(
     """A dict for each metric, task and method (label), the baseline among them; what cannot be told is NaN.
 
     `n`, `mean` and `half_width` (Student's t, 95%) are over all finished runs that have the metric. Everything else is
-    over the `pairs` with the baseline (task, seed and steps agree): `ratio` of the means where the baseline's is above
-    0, `change` over its absolute value with its interval, `effect` (d_z), exact Wilcoxon `p` beside the `smallest_p`
-    that so many pairs can give, `p_holm` over the tasks of this method and metric, `improvement`, the probability that
-    a run of the method beats one of the baseline, with its interval, and `difference`, the mean of the paired
-    differences, with `difference_half_width` (Student's t, 95%). `unpaired` names the runs in no pair.
+    over the `pairs` with the baseline (task, seed and steps agree): `ratio`, the median of the pairs' where the
+    baseline's are above 0, and `change` of the mean over the baseline's absolute value, both with their intervals,
+    `effect` (d_z), exact Wilcoxon `p` beside the `smallest_p` that so many pairs can give, `p_holm` over the tasks of
+    this method and metric, `improvement`, the probability that a run of the method beats one of the baseline, with its
+    interval, and `difference`, the mean of the paired differences, with `difference_half_width` (Student's t, 95%).
+    `unpaired` names the runs in no pair.
 
     `reps` is the number of resamples. A run that is not finished is left out with a warning. Raises `InputError` for a
     baseline that no run has, and for runs of several budgets on one task.
@@ -126,9 +128,9 @@ def _row(
     mean, half_width = mean_interval(own)
     row: dict[str, Any] = {"task": task, "method": method, "baseline": baseline, "metric": metric, "n": len(own)}
     row |= {"mean": mean, "half_width": half_width, "pairs": 0, "unpaired": []}
-    row |= dict.fromkeys(("ratio", "change", "change_low", "change_high", "effect"), math.nan)
+    row |= dict.fromkeys(("change", "change_low", "change_high", "effect"), math.nan)
     row |= dict.fromkeys(("difference", "difference_half_width", "p", "smallest_p", "p_holm"), math.nan)
-    row |= _named("improvement", (math.nan,) * 3)
+    row |= _named("improvement", (math.nan,) * 3) | _named("ratio", (math.nan,) * 3)
     if method == baseline:
         return row
     row["unpaired"] = list(pairs.unpaired.get(task, ()))
@@ -138,7 +140,7 @@ def _row(
     return row | {
         "pairs": len(x),
         **dict(zip(("difference", "difference_half_width"), mean_interval(x - y), strict=True)),
-        "ratio": float(x.mean() / y.mean()) if y.mean() > 0 else math.nan,
+        **_named("ratio", median_ratio(x, y, reps)),
         **_named("change", relative_change(x, y, reps)),
         "effect": cohens_d_paired(x, y),
         "p": paired_wilcoxon(x, y),

@@ -205,6 +205,19 @@ def _change(pairs: Float[np.ndarray, "... n 2"]) -> Any:
     return np.divide(x - y, np.abs(y), out=np.full(np.shape(y), np.nan), where=y != 0)
 
 
+def median_ratio(x: Values, y: Values, reps: int = REPS, seed: int = 0, level: float = 0.95) -> Interval:
+    """Median over matched runs of x / y, with a bootstrap interval that resamples pairs; NaN unless every y is above 0.
+
+    For costs: one run that had to share its core can be ten times as long as it should, and a mean is then its alone.
+    Raises `InputError` if `x` and `y` differ in length.
+    """
+    pairs = matched(x, y)
+    if not (pairs[:, 1] > 0).all():
+        return Interval(math.nan, math.nan, math.nan)
+    ratios = {"": pairs[:, 0] / pairs[:, 1]}
+    return stratified_bootstrap(ratios, lambda drawn: np.median(drawn[""], axis=-1), reps, seed, level, at_once=True)
+
+
 def matched(x: Values, y: Values) -> Float[np.ndarray, "n 2"]:
     """Two columns of matched runs; raises `InputError` if they differ in length."""
     x, y = finite("x", x), finite("y", y)

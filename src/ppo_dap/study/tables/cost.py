@@ -29,7 +29,7 @@ from ppo_dap.study.tables.table import (
 
 PRESETS = ("paper", "tuned")
 MEMORY = "Peak memory is that of the process; the paper's is the GPU's."
-SPREAD = "±: standard deviation over the tasks; on each task the ratio of means over pairs of seeds."
+SPREAD = "±: standard deviation over the tasks; on each task the median of the ratios of pairs of seeds."
 
 
 class _Measure(NamedTuple):

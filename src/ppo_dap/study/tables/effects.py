@@ -25,8 +25,9 @@ COSTS = ("steps_per_second", "seconds_per_step", "peak_mib")
 SHARES = ("proposals_share", "pet_share")
 """Seconds of the device over those of the iterations; what goes by beside the rollout costs less than this."""
 _TOLD = (
-    "mean", "half_width", "ratio", "difference", "difference_half_width", "change", "change_low", "change_high",
-    "effect", "p", "smallest_p", "p_holm", "improvement", "improvement_low", "improvement_high",
+    "mean", "half_width", "ratio", "ratio_low", "ratio_high", "difference", "difference_half_width", "change",
+    "change_low", "change_high", "effect", "p", "smallest_p", "p_holm", "improvement", "improvement_low",
+    "improvement_high",
 )  # fmt: skip
 _OVERALL = ("iqm", "iqm_low", "iqm_high", "iqm_baseline", "iqm_baseline_low", "iqm_baseline_high")
 NOTHING: Row = {"n": 0, "pairs": 0, "tasks": 0} | dict.fromkeys((*_TOLD, *_OVERALL), math.nan)

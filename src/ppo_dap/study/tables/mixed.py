@@ -1,7 +1,10 @@
-"""Logs of several gaits: every arm, the whole against the clones, and what each part of it is worth."""
+"""Logs of several gaits: every arm, the whole against clones, what a part is worth, and the paper's settings."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from ppo_dap.methods import get_method
 from ppo_dap.study.results import Results
 from ppo_dap.study.store.grids import Study
 from ppo_dap.study.store.studies import PPO, TUNED_WARM
@@ -22,6 +25,8 @@ from ppo_dap.study.tables.table import (
 )
 
 WHOLE = TUNED_WARM.name
+PAPER = get_method("ppo-dap").row
+"""PPO-DAP with the paper's settings: no start from logs."""
 
 
 def mixed(results: Results, study: Study) -> Table:
@@ -29,7 +34,7 @@ def mixed(results: Results, study: Study) -> Table:
     title, runs = "Logs of several gaits", view(results, study, "mixed", "early")
     views = [runs]
     records = _records(runs)
-    more = [_clones(runs, study.epochs), _parts(runs, study.epochs)] if records else []
+    more = [_clones(runs, study.epochs), _parts(runs, study.epochs), *_others(runs, study.epochs)] if records else []
     if any((entry.labels["study"], entry.labels["part"]) == ("mixed", "full") for entry in study.entries):
         long = view(results, study, "mixed", "full")
         views.append(long)
@@ -71,12 +76,26 @@ def _clones(runs: View, epochs: float, which: str = "") -> Table:
     """The whole against what has only its start, and against PPO."""
     baselines = [arm for arm, labels in runs.arms.items() if labels["method"] in ("ppo-bc", PPO.method)]
     measures = {"alc": f"ALC@{epochs:g}", "last_return": f"return after {runs.steps:,} steps"}
+    return _against(runs, WHOLE, baselines, measures, f"{WHOLE} against clones and PPO{which}")
+
+
+def _others(runs: View, epochs: float) -> list[Table]:
+    """PPO-DAP as the paper has it against every other method without a start from logs."""
+    if PAPER not in runs.arms:
+        return []
+    baselines = [a for a, own in runs.arms.items() if own["preset"] == PPO.preset and own["method"] != "ppo-bc"]
+    baselines.remove(PAPER)
+    title = f"{PAPER} with the paper's settings against every other method"
+    return [_against(runs, PAPER, baselines, {"alc": f"ALC@{epochs:g}"}, title)]
+
+
+def _against(runs: View, whole: str, baselines: Sequence[str], measures: dict[str, str], title: str) -> Table:
     rows = []
     for baseline in baselines:
-        found = runs.effects(baseline, list(measures), [WHOLE, baseline])
+        found = runs.effects(baseline, list(measures), [whole, baseline])
         for metric, measure in measures.items():
             for task in runs.tasks:
-                own = found[metric, task, WHOLE]
+                own = found[metric, task, whole]
                 if own["pairs"]:
                     rows.append({"against": baseline, "measure": measure, **own})
     columns: Columns = {
@@ -86,7 +105,7 @@ def _clones(runs: View, epochs: float, which: str = "") -> Table:
         "change": lambda row: change_text(row, row["pairs"]),
         **TESTS,
     }
-    return listed(f"{WHOLE} against clones and PPO{which}", rows, columns, [TESTED], words=3)
+    return listed(title, rows, columns, [TESTED], words=3)
 
 
 def _parts(runs: View, epochs: float) -> Table:

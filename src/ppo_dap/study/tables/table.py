@@ -26,8 +26,8 @@ TESTED = (
 OTHER_LOGS = "The paper's tasks are -v2 and -v3 and its logs are not ours: compare changes, not returns."
 WALL = (
     "Wall-clock: seconds of all iterations after the two that compile, over their environment steps, without those of "
-    "over three times the median. Runs of a study share a machine, so what else was going on is in it; "
-    "docs/performance.md has the figures of a quiet one."
+    "over three times the median; x: median of the pairs' ratios. Runs of a study share a machine, so what else was "
+    "going on is in it; docs/performance.md has the figures of a quiet one."
 )
 
 
@@ -152,8 +152,7 @@ def change_text(row: Row, of: int | None = None) -> str:
 
 def ratio_text(row: Row, of: int | None = None) -> str:
     """A cost over the baseline's, its interval and number of pairs."""
-    edges = (1 + row["change_low"], 1 + row["change_high"])  # costs are above 0: the ratio is the change and one
-    return with_n(interval_text(row["ratio"], *edges, ".2f"), row["pairs"], of)
+    return with_n(interval_text(row["ratio"], row["ratio_low"], row["ratio_high"], ".2f"), row["pairs"], of)
 
 
 def difference_text(row: Row, of: int | None = None) -> str:
