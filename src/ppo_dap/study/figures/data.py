@@ -17,6 +17,7 @@ from ppo_dap.study.stats.measures import (
     REPS,
     mean_interval,
     mean_relative_change,
+    median_ratio,
     relative_change,
     stratified_bootstrap,
 )
@@ -111,7 +112,7 @@ def cost_ratios(rows: Sequence[Row], arm: str, baseline: str) -> dict[str, Dot]:
     found = {}
     for task, pairs in paired(rows, arm, baseline, "wall").values.items():
         x, y = pairs.T
-        found[task] = Dot(float(np.median(x / y)), math.nan, math.nan, {"": (x / y).tolist()}, len(x))
+        found[task] = Dot(median_ratio(x, y).value, math.nan, math.nan, {"": (x / y).tolist()}, len(x))
     return found
 
 
