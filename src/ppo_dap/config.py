@@ -231,7 +231,9 @@ class Config:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
-    "tuned": {"lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "kl_rule": "monitor"},
+    "tuned": {
+        "lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "kl_rule": "monitor", "mode_seeking": 1.0,
+    },
     "tuned-warm": {
         "lambda_kl": 0.2, "lambda_aux": 0.0, "lambda_decay": 0.5, "kl_rule": "monitor",
         "warm_start": "actor_critic", "logs_filter": 0.3,

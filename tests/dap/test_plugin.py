@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import ppo_dap
+from ppo_dap.config import make
 from ppo_dap.errors import InputError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "guide_in_another_ppo.py"
@@ -192,12 +193,22 @@ def test_a_bad_batch_is_refused_in_one_line_and_changes_nothing(prior, batch, na
         ({"num_proposal": 3}, "num_proposal'.*num_proposals"),
         ({"preset": "papers"}, "papers'.*paper"),
         ({"beta_max": -1.0}, "beta_max must be"),
+        ({"mode_seeking": 0.5}, "mode_seeking 0.5 needs this package's own PPO: a Guide has 0.0"),
+        ({"preset": "tuned", "q_target": "gae"}, "q_target 'gae' needs this package's own PPO: a Guide has 'td'"),
     ],
 )
 def test_bad_options_are_refused_in_one_line(prior, options, message):
     with pytest.raises(InputError, match=message) as caught:
         guide_of(prior, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_of_a_preset_it_has_all_but_what_needs_the_policy(prior, batch):
+    guide = guide_of(prior, preset="tuned")
+    assert make("tuned").proposals.mode_seeking > 0
+    assert guide.config.proposals.mode_seeking == 0
+    assert guide.config.objective == make("tuned").objective
+    assert np.isfinite(guide(**batch).actions).all()
 
 
 def test_the_example_runs_and_is_short():

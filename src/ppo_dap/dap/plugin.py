@@ -34,7 +34,7 @@ from ppo_dap.ppo.update import draw_orders
 from ppo_dap.priors import Prior
 
 _WITHOUT_OUR_PPO = {"q_target": "td", "q_calibration": "none", "guidance_gate": False, "mode_seeking": 0.0}
-"""What needs the advantages or the policy, which a Guide is not given."""
+"""What needs the advantages or the policy, which a Guide is not given; a preset that has it is used without."""
 
 
 class Guide:
@@ -54,11 +54,11 @@ class Guide:
         if not isinstance(total_iterations, int) or total_iterations < 1:
             raise InputError(f"total_iterations must be a whole number above 0, not {total_iterations!r}")
         given = options | {"q_trunk": "separate"}
-        self.config = resolve(METHODS["ppo-dap"], configs.make(preset, **given), given, prior.kind)
         for name, right in _WITHOUT_OUR_PPO.items():
-            if configs.flatten(self.config)[name] != right:
-                found = configs.flatten(self.config)[name]
-                raise InputError(f"{name} {found!r} needs this package's own PPO: a Guide has {right!r}")
+            if given.get(name, right) != right:
+                raise InputError(f"{name} {given[name]!r} needs this package's own PPO: a Guide has {right!r}")
+        given |= _WITHOUT_OUR_PPO
+        self.config = resolve(METHODS["ppo-dap"], configs.make(preset, **given), given, prior.kind)
         self.prior, self.iteration, self._total = prior, 0, total_iterations
         self._condition = jnp.asarray(prior.condition(self.config.proposals.prior_return))
         self._moments = RunningMoments.create(prior.observation_size)

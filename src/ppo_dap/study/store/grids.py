@@ -12,6 +12,9 @@ from ppo_dap.study.stats.measures import EPOCH
 from ppo_dap.study.store import cells
 from ppo_dap.study.store.cells import Cell, in_order
 
+FITS: dict[str, dict[str, Any]] = {"tuned": {"logs_filter": 0.3}, "tuned-warm": {"logs_filter": 0.3}}
+"""Preset -> what its priors see of the logs, where studies do not say otherwise."""
+
 
 class Setting(NamedTuple):
     """A task and the tier of its logs."""
@@ -28,7 +31,7 @@ class Arm(NamedTuple):
     preset: str = "paper"
     options: Mapping[str, Any] = {}
     fit: Mapping[str, Any] = {}
-    """Of the prior: coverage, or fields of its settings."""
+    """Of the prior: coverage, or fields of its settings, over what the preset's priors have (`FITS`)."""
     axes: Mapping[str, Any] = {}
     """What a figure puts on an axis: more labels."""
 
@@ -120,7 +123,7 @@ class Scale:
             setting.task,
             arm.method,
             arm.preset,
-            prior=self.prior(setting, method.prior, arm.fit) if guided else None,
+            prior=self.prior(setting, method.prior, {**FITS.get(arm.preset, {}), **arm.fit}) if guided else None,
             logs=self.logs(setting) if warm else None,
             seed=seed,
             steps=steps,
