@@ -49,7 +49,8 @@ class Guide:
     def __init__(self, prior: Prior, *, total_iterations: int, preset: str = "paper", **options: Any):
         """`total_iterations` of the run, for the annealing of beta; `options` are fields of `Config` by name.
 
-        Q has a trunk of its own here, since this PPO's value network is not ours to read.
+        Q has a trunk of its own here, since this PPO's value network is not ours to read, and a preset's `mode_seeking`
+        is left out, since the policy is not either.
         """
         if not isinstance(total_iterations, int) or total_iterations < 1:
             raise InputError(f"total_iterations must be a whole number above 0, not {total_iterations!r}")
