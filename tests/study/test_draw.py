@@ -7,7 +7,7 @@ import pytest
 from ppo_dap.cli import main
 from ppo_dap.errors import InputError
 from ppo_dap.study import draw as drawing
-from ppo_dap.study.draw import Page, draw, fill, save_pages
+from ppo_dap.study.draw import BLOCK, Page, draw, fill, save_pages
 from ppo_dap.study.results import Results, load_results
 from ppo_dap.study.store.grids import Scale
 from ppo_dap.study.store.studies import make_study, parts
@@ -128,7 +128,11 @@ def test_drawing_runs_nothing_and_keeps_what_was_measured(drawn, tmp_path, capsy
 
 def test_the_documents_tables_are_those_of_the_committed_files(tmp_path):
     document = Path(__file__).parents[2] / "docs" / "results.md"
-    pages = draw(make_study("mixed"), load_results(document.parent / "results"), tmp_path)
-    assert "mixed" in pages
-    assert fill(document, pages, document.parent / "results") == document.read_text()
-    assert {path.name for path in tmp_path.iterdir()} <= {path.name for path in (document.parent / "results").iterdir()}
+    folder = document.parent / "results"
+    results, text = load_results(folder), document.read_text()
+    pages = {}
+    for block in BLOCK.finditer(text):
+        pages |= draw(make_study(block["name"]), results, tmp_path)
+    assert {"mixed", "table5", "fig11"} <= pages.keys()
+    assert fill(document, pages, folder) == text
+    assert {path.name for path in tmp_path.iterdir()} <= {path.name for path in folder.iterdir()}

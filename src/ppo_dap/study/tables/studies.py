@@ -122,6 +122,7 @@ def table5(results: Results, study: Study) -> Table:
     area = f"ALC@{study.epochs:g}"
     first = _against_ppo(early, "alc", "Table 5(a)", f"{area}, runs of {early.steps:,} steps", area)
     more = [
+        _against_ppo(early, "last_return", "Table 5", f"return after {early.steps:,} steps", "return"),
         _against_ppo(full, "alc", "Table 5(a)", f"{area}, runs of {full.steps:,} steps", area),
         _against_ppo(full, "last_return", "Table 5(b)", f"return after {full.steps:,} steps", "return"),
     ]
