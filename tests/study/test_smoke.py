@@ -20,6 +20,7 @@ def test_smoke_makes_every_table_and_figure(tmp_path):
     results = load_results(folder)
     assert results.runs.keys() == {cell.name for cell in study.cells() if cell.kind == "run"}
     assert results.reports.keys() == {cell.name for cell in study.cells() if cell.kind == "reliability"}
+    assert not any("/" in str(value) for row in results.reports.values() for value in row.values())  # no folder of ours
     assert results.proposals
     assert all(row["as_declared"] for row in results.runs.values())
     assert {row["method"] for row in results.runs.values() if not row["strictly_on_policy"]} == {"ppo-arc"}

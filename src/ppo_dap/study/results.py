@@ -119,6 +119,8 @@ def gather(store: Store, cells: Iterable[Cell], results: Results) -> Results:
             ]
         if cell.kind == "reliability" and cell.name not in results.reports:
             report = json.loads(store.artefact(cell).read_text())
+            # Where the run lay is this store's affair: the files are kept where it is not.
+            del report["run"]
             results.reports[cell.name] = {"of": cell.needs["run"].name} | dict(_flat(report))
     return results
 

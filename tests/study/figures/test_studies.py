@@ -1,9 +1,12 @@
 """Every figure as a file, and those that must not be drawn."""
 
+import re
+
 import pytest
 from matplotlib.image import imread
 
 from ppo_dap.study.figures.studies import DRAWINGS, FIGURES, figures_of
+from ppo_dap.study.plots.drawing import numbered
 from ppo_dap.study.results import Results
 from ppo_dap.study.store.studies import SMOKE, STUDIES, make_study, parts
 from study.figures.levels_made import made_results
@@ -66,3 +69,18 @@ def test_there_is_no_change_without_the_baseline(name):
         assert [len(axes.get_legend_handles_labels()[1]) for axes in found["fig12"].axes] == [0, 0, 1, 1]
     else:
         assert list(found) == (["fig9"] if name == "fig9" and found else [])
+
+
+def test_names_inside_a_figure_do_not_feel_the_last_bit_of_its_layout(smoke, tmp_path):
+    one, other = (b'<clipPath id="p%s"/><use xlink:href="#m0123456789"/><g clip-path="url(#p%s)"/>' % (x, x)
+                  for x in (b"86e59be5cf", b"6d8208f5f3"))  # fmt: skip
+    assert numbered(one) == numbered(other) != numbered(one.replace(b"m0123456789", b"p86e59be5cf"))
+    study, results = smoke
+    (part,) = (part for part in parts(study) if part.name == "fig6")
+    (path,) = (path for path in FIGURES["fig6"](results, part, tmp_path) if path.suffix == ".svg")
+    text = path.read_text()
+    named, used = re.findall(r' id="([^"]+)"', text), re.findall(r'(?:href="|url\()#([^")]+)', text)
+    assert len(named) == len(set(named))
+    assert used
+    assert set(used) <= set(named)
+    assert not re.search(r"[0-9a-f]{10}[\")]", text)

@@ -6,6 +6,7 @@ Nothing is told by colour alone: what differs in colour differs in dash and mark
 from __future__ import annotations
 
 import io
+import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -38,9 +39,11 @@ HOUSE: dict[str, Any] = {
     "axes.grid": True, "grid.alpha": 0.3, "grid.linewidth": 0.6, "axes.axisbelow": True, "figure.dpi": 100,
     # Letters as paths: a viewer without the font would set them wider and over each other.
     "svg.fonttype": "path",
-    # Names inside the file are hashes of this and of what they name, instead of random ones.
+    # Names inside the file are hashes of this and of what they name, instead of random ones; `numbered` does the rest.
     "svg.hashsalt": "ppo-dap",
 }  # fmt: skip
+HASH = re.compile(rb"(?<=[mph_])[0-9a-f]{10}(?=[\")_])")
+"""What follows the kind (marker, path, hatch, collection) in a name inside an .svg."""
 WRITTEN = {"svg": {"Date": None, "Creator": None}, "png": {"Software": None}}
 """Metadata by format: neither the hour nor a version, so that a figure changes where its data do."""
 
@@ -102,8 +105,19 @@ def write(figure: Figure, folder: Path, name: str) -> list[Path]:
             content = io.BytesIO()
             figure.savefig(content, format=suffix, dpi=DPI, metadata=metadata)
             paths.append(folder / f"{name}.{suffix}")
-            write_atomically(paths[-1], content.getvalue())
+            made = content.getvalue()
+            write_atomically(paths[-1], numbered(made) if suffix == "svg" else made)
     return paths
+
+
+def numbered(svg: bytes) -> bytes:
+    """`svg` with numbers for matplotlib's hashed names, which feel the last bit of a layout that prints the same."""
+    numbers: dict[bytes, bytes] = {}
+
+    def number(found: re.Match[bytes]) -> bytes:
+        return numbers.setdefault(found[0], b"%d" % len(numbers))
+
+    return HASH.sub(number, svg)
 
 
 def head(figure: Figure, title: str, missing: Sequence[str] = (), note: str = "") -> None:
