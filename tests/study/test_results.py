@@ -30,6 +30,7 @@ def store(tmp_path):
     out = store.out(done)
     out.mkdir(parents=True)
     config = {"task": "Pendulum-v1", "method": "ppo", "prior_hash": None, "config": {"pet_frequency": 0, "steps": 8000}}
+    config["processor"] = "A processor"
     (out / "config.json").write_text(json.dumps(config))
     (out / "audit.json").write_text(json.dumps({"static": []}))
     rows = [
@@ -60,6 +61,7 @@ def test_figures_of_a_run_are_those_of_its_tables(store):
     assert (row["spr"], row["oglr"], row["batch_fresh"], row["pgshare"]) == (0.5, 0.25, 0.5, 0.5)
     assert row["pgshare_mean"] == 0.75
     assert (row["seconds"], row["peak_mib"]) == (12.5, 100.0)
+    assert (row["logs_hash"], row["processor"]) == ("", "A processor")
     # A claim is violated, by the third iteration, and the method does not declare it.
     assert (row["strictly_on_policy"], row["as_declared"]) == (False, False)
 

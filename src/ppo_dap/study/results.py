@@ -36,7 +36,7 @@ MEANS = ("ess", "high_q_rate", "acceptance", "guided_displacement", "q_rank", "p
 """Metrics of which a run's mean over its iterations is kept, NaN left out."""
 WORST = {"spr": min, "pgshare": min, "oglr": max, "batch_fresh": min}
 """Measures of the audit (5.8), each by its worst iteration."""
-WORDS = ("cell", "of", "task", "logs", "method", "preset", "options")
+WORDS = ("cell", "of", "task", "logs", "method", "preset", "options", "logs_hash", "processor")
 """Columns whose values are no numbers, whatever they look like."""
 COUNTS = ("seed", "steps", "env_steps", "state", "guided", "drawn")
 """Columns of whole numbers."""
@@ -113,7 +113,7 @@ def gather(store: Store, cells: Iterable[Cell], results: Results) -> Results:
             continue
         if cell.kind == "run" and cell.name not in results.runs:
             run = load_run(store.out(cell))
-            results.runs[cell.name] = _identity(cell) | _measured(run) | store.cost(cell)
+            results.runs[cell.name] = _identity(cell) | _measured(run) | store.cost(cell) | _origin(run)
             results.curves[cell.name] = [
                 {name: row[name] for name in ("env_steps", "return_mean", "length_mean")} for row in run.evaluations
             ]
@@ -137,6 +137,15 @@ def _identity(cell: Cell) -> Row:
         "options": " ".join(f"{name}={value}" for name, value in call.items()),
         "seed": cell.settings["seed"],
         "steps": cell.settings["steps"],
+    }
+
+
+def _origin(run: Run) -> Row:
+    """What decides whether runs may stand beside each other: their logs, and whose floating-point bits they have."""
+    config = run.config
+    return {
+        "logs_hash": config["prior_hash"] or config.get("logs_hash") or "",
+        "processor": config.get("processor", ""),
     }
 
 

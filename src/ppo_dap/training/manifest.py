@@ -31,7 +31,7 @@ def prepare_jax() -> None:
 
 
 def manifest() -> dict[str, Any]:
-    """Versions, device, the precision of products, processor flags that change floating-point results, and `NPROC`."""
+    """Versions, device, the precision of products, the processor with its vector extensions, and `NPROC`."""
     import jax
 
     versions = {}
@@ -46,16 +46,26 @@ def manifest() -> dict[str, Any]:
         "machine": platform.machine(),
         "device": jax.devices()[0].device_kind,
         "matmul_precision": jax.config.jax_default_matmul_precision,  # type: ignore[attr-defined]
+        "processor": processor(),
         "cpu_flags": _cpu_flags(),
         "NPROC": os.environ.get("NPROC"),
     }
 
 
+def processor() -> str:
+    """The processor's name, where the system tells it."""
+    return _cpuinfo("model name") or platform.processor()
+
+
 def _cpu_flags() -> list[str]:
     """Vector extensions of the processor, where the system says so."""
+    return sorted(flag for flag in _cpuinfo("flags").split() if flag.startswith(("avx", "fma", "sse4")))
+
+
+def _cpuinfo(name: str) -> str:
+    """What Linux says of the first core under this name, or nothing."""
     try:
         with open("/proc/cpuinfo") as file:
-            line = next((line for line in file if line.startswith("flags")), "")
+            return next((line.split(":", 1)[1].strip() for line in file if line.startswith(name)), "")
     except OSError:
-        return []
-    return sorted(flag for flag in line.split() if flag.startswith(("avx", "fma", "sse4")))
+        return ""

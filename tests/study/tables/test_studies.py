@@ -47,6 +47,28 @@ def test_table_4_has_the_papers_returns_above_ours(table4):
     assert table4.made[1] == f"No finished run yet: PPO-DAP (tuned); {WARM}; PPO-GC; ABPPO."
 
 
+def test_seeds_that_had_other_logs_and_processors_are_told(studies):
+    def numbers(labels, hashes="ab", processors=("One", "")):
+        numbers = table4_numbers(labels)
+        if numbers is None or labels["arm"] == "PPO":
+            return numbers
+        return numbers | {"logs_hash": hashes[labels["seed"] > 0], "processor": processors[labels["seed"] > 1]}
+
+    told = TABLES["table4"](made(studies["table4"], numbers), studies["table4"]).made
+    (logs,) = [note for note in told if note.startswith("**Seeds of an arm had different logs**")]
+    # Arms with one seed on a task, and PPO, which has no logs, cannot have others.
+    assert logs.endswith(
+        "PPO-DAP on Hopper-v5 (2 of tier medium-expert); PPO-ARC on Hopper-v5 (2 of tier medium-expert); "
+        "PPO-DAP on Pusher-v5 (2 of tier medium-expert)."
+    )
+    (processors,) = [note for note in told if note.startswith("Made on several processors")]
+    assert processors.endswith("One (7 runs), not recorded (8 runs).")
+
+    alike = functools.partial(numbers, hashes="aa", processors=("One", "One"))
+    (one,) = TABLES["table4"](made(studies["table4"], alike), studies["table4"]).made[2:]
+    assert one.endswith("One (9 runs), not recorded (6 runs).")
+
+
 def test_changes_are_over_the_absolute_value_and_are_not_told_by_few_pairs(table4):
     lines = body(table4)
     of = lines["Table 4: change over PPO", "PPO-DAP", "Hopper-v5"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
 import statistics
 import subprocess
@@ -176,7 +175,7 @@ def bench(tasks: Sequence[str], steps: int, repeats: int, peers: Path | None, sa
         run = Bench(Path(folder), steps, repeats, peers, say)
         figures = {task: run.task(task) for task in tasks}
     prepare_jax()  # as the runs had it, and no sooner: the peers are started as their users start them
-    about = manifest() | {"processor": processor(), "cores": os.cpu_count(), "seconds": time.perf_counter() - start}
+    about = manifest() | {"cores": os.cpu_count(), "seconds": time.perf_counter() - start}
     return {"command": " ".join(["ppo-dap", *sys.argv[1:]]), "machine": about, "tasks": figures}
 
 
@@ -204,15 +203,6 @@ def print_bench(figures: Mapping[str, Any]) -> None:
     device = "" if machine["device"] == "cpu" else f", {machine['device']}"
     print(f"{machine['processor']}, {machine['cores']} cores{device}; Python {machine['python']}, {versions}")
     print(f"{figures['command']}   ({machine['seconds']:,.0f} s)")
-
-
-def processor() -> str:
-    """The processor's name, where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
 
 
 def train_for(folder: Path, task: str, options: Sequence[str], steps: int) -> float:

@@ -25,7 +25,7 @@ LEVEL = 0.05
 """A lead with a paired p below this is called one."""
 ENOUGH = next(n for n in itertools.count(1) if smallest_p(n) < LEVEL)
 """Fewest pairs whose exact test can give a p below `LEVEL`."""
-SURROUNDINGS = ("prior_hash", "logs_hash", "python", "machine", "cpu_flags", "NPROC")
+SURROUNDINGS = ("prior_hash", "logs_hash", "python", "machine", "processor", "cpu_flags", "NPROC")
 """What config.json says beside the settings and the packages' versions."""
 BROKEN = (InputError, OSError, ValueError, LookupError, TypeError, AttributeError)
 """What reading a damaged run folder can raise."""

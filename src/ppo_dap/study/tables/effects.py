@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -178,9 +178,9 @@ def spelled(numbers: Sequence[int]) -> str:
 
 
 def made_by(study: Study, *views: View) -> list[str]:
-    """How the runs of a table are made, and how many there are."""
+    """How the runs of a table are made, how many there are, and whether their logs and processors are the same."""
     cells = {entry.cell.name for each in views for entry in each.study.entries}
-    done = {row["run"] for each in views for row in each.rows}
+    done = {row["run"]: row for each in views for row in each.rows}
     parts, lacking = [], []
     for each in views:
         seeds = spelled(sorted({entry.labels["seed"] for entry in each.study.entries}))
@@ -193,4 +193,21 @@ def made_by(study: Study, *views: View) -> list[str]:
     notes = [f"`{command(study)}`: {what}; {len(done)} of {len(cells)} runs are finished."]
     if lacking and done:
         notes.append(f"No finished run yet: {'; '.join(lacking)}.")
+    return notes + _origins(done.values())
+
+
+def _origins(rows: Iterable[Row]) -> list[str]:
+    """What is to be said of runs that were not all made from the same logs, or on the same processor."""
+    notes, logs, processors = [], defaultdict(set), Counter()
+    for row in rows:
+        if row.get("logs_hash"):
+            logs[f"{row['label']} on {row['task']}", row["logs"]].add(row["logs_hash"])
+        processors[row.get("processor") or "not recorded"] += 1
+    if apart := [f"{arm} ({len(hashes)} of tier {tier})" for (arm, tier), hashes in logs.items() if len(hashes) > 1]:
+        notes.append(
+            f"**Seeds of an arm had different logs**, so they are no sample of one experiment: {'; '.join(apart)}."
+        )
+    if len(processors) > 1:
+        told = ", ".join(f"{name} ({n} runs)" for name, n in sorted(processors.items()))
+        notes.append(f"Made on several processors, on which a prior has other bits: {told}.")
     return notes
