@@ -98,6 +98,26 @@ def test_files_hold_what_was_gathered(store, tmp_path):
     assert gather(store, [done], again) == found
 
 
+def test_a_run_that_the_store_made_again_takes_the_old_ones_place(store, tmp_path):
+    store, done, _ = store
+    found = gather(store, [done], Results())
+    found.reports["r"] = {"of": done.name, "states": 4}
+    found.reports["s"] = {"of": "another", "states": 4}
+    found.proposals[done.name] = [{"state": 0}]
+    found.save(tmp_path / "results")
+    # Another store has made the same cell, on another processor.
+    other = Store(tmp_path / "other")
+    other.out(done).mkdir(parents=True)
+    for path in store.out(done).iterdir():
+        (other.out(done) / path.name).write_text(path.read_text().replace("A processor", "Another"))
+    other.finish(done.name)
+    other.note(done.name, end="done", seconds=7.0, peak_mib=100.0)
+    kept = gather(other, [done], load_results(tmp_path / "results"))
+    assert (kept.runs[done.name]["processor"], kept.runs[done.name]["seconds"]) == ("Another", 7.0)
+    # What was measured on the old one is none of the new one's.
+    assert (list(kept.reports), kept.proposals) == (["s"], {})
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [

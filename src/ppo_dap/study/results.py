@@ -72,6 +72,12 @@ class Results:
             found.append(row | {"alc": alc(curve, study.epochs) if reached else None})
         return found
 
+    def forget(self, cell: str) -> None:
+        """Leave out a run and what was taken of it."""
+        for table in (self.runs, self.curves, self.proposals):
+            table.pop(cell, None)
+        self.reports = {name: row for name, row in self.reports.items() if row["of"] != cell}
+
     def save(self, folder: Path) -> None:
         """Write the files; rows are in the order of their cells' names, so that a file changes where runs do."""
         for name, rows in (
@@ -105,14 +111,15 @@ def load_results(folder: Path) -> Results:
 
 
 def gather(store: Store, cells: Iterable[Cell], results: Results) -> Results:
-    """`results` with what the store has made of these cells since."""
+    """`results` with what the store has made of these cells since; a run made anew takes the old one's place."""
     from ppo_dap.training.run import load_run
 
     for cell in cells:
         if not store.done(cell):
             continue
-        if cell.kind == "run" and cell.name not in results.runs:
+        if cell.kind == "run" and not _is_kept(cell, store, results):
             run = load_run(store.out(cell))
+            results.forget(cell.name)
             results.runs[cell.name] = _identity(cell) | _measured(run) | store.cost(cell) | _origin(run)
             results.curves[cell.name] = [
                 {name: row[name] for name in ("env_steps", "return_mean", "length_mean")} for row in run.evaluations
@@ -123,6 +130,12 @@ def gather(store: Store, cells: Iterable[Cell], results: Results) -> Results:
             del report["run"]
             results.reports[cell.name] = {"of": cell.needs["run"].name} | dict(_flat(report))
     return results
+
+
+def _is_kept(cell: Cell, store: Store, results: Results) -> bool:
+    """Whether the run in the store is the one whose row there is, which nobody need read again: no two take as long."""
+    row = results.runs.get(cell.name)
+    return row is not None and all(_cell(row.get(name)) == _cell(value) for name, value in store.cost(cell).items())
 
 
 def _identity(cell: Cell) -> Row:
