@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from ppo_dap.errors import InputError
 from ppo_dap.storage import write_atomically
-from ppo_dap.study.stats.measures import COMPILED_AFTER, EPOCH, alc
+from ppo_dap.study.stats.measures import COMPILED_AFTER, EPOCH, alc, late_return
 
 if TYPE_CHECKING:
     from ppo_dap.study.store.cells import Cell
@@ -58,8 +58,8 @@ class Results:
     def rows(self, study: Study, **wanted: Any) -> list[Row]:
         """A row for each entry of the study that is a finished run and has these labels.
 
-        Its labels, `label` (the arm, for `compare`), `run` (the cell), `alc` at the study's T and everything that
-        runs.csv says of it; `alc` is None for a run whose evaluations end before T.
+        Its labels, `label` (the arm, for `compare`), `run` (the cell), `alc` at the study's T, `late_return` and
+        everything that runs.csv says of it; `alc` is None for a run whose evaluations end before T.
         """
         found = []
         for entry in study.entries:
@@ -69,7 +69,8 @@ class Results:
             curve = self.curves[name]
             reached = bool(curve) and curve[-1]["env_steps"] >= study.epochs * EPOCH
             row = {"run": name, "label": labels["arm"], "finished": True} | self.runs[name] | labels
-            found.append(row | {"alc": alc(curve, study.epochs) if reached else None})
+            area = alc(curve, study.epochs) if reached else None
+            found.append(row | {"alc": area, "late_return": late_return(curve) if curve else None})
         return found
 
     def forget(self, cell: str) -> None:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ppo_dap.study.stats.measures import alc
+from ppo_dap.study.stats.measures import alc, late_return
 
 
 def rows(steps, returns):
@@ -30,3 +30,11 @@ def test_alc_against_a_fine_sum():
 def test_a_run_that_ends_too_early_has_no_alc():
     with pytest.raises(ValueError, match="end at 150000 steps, before 200000"):
         alc(rows([0, 150_000], [0, 1]))
+
+
+def test_the_late_return_is_the_mean_over_the_last_tenth_of_the_steps():
+    curve = rows([0, 89_999, 90_000, 95_000, 100_000], [0, 1e9, 1, 2, 6])
+    assert late_return(curve) == 3.0
+    assert late_return(curve[-1:]) == 6.0
+    with pytest.raises(ValueError, match="without evaluations"):
+        late_return([])

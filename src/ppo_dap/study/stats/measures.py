@@ -52,6 +52,17 @@ def alc(evaluations: Sequence[Mapping[str, Any]], epochs: float = 40) -> float:
     return float(np.trapezoid(returns, steps) / end)
 
 
+def late_return(evaluations: Sequence[Mapping[str, Any]]) -> float:
+    """Mean of the evaluations in the last tenth of a run's steps: of more episodes than the last evaluation alone.
+
+    Learning rates are near 0 by then, so these policies are almost one. Raises `ValueError` where there is none.
+    """
+    if not evaluations:
+        raise ValueError("a run without evaluations has no return")
+    begin = 0.9 * evaluations[-1]["env_steps"]
+    return float(np.mean([row["return_mean"] for row in evaluations if row["env_steps"] >= begin]))
+
+
 def finite(name: str, values: Values) -> Float[np.ndarray, " _"]:
     """`values` as float64; raises `InputError` for none at all, more than one axis, or one that is not finite."""
     found = np.asarray(values, np.float64)
