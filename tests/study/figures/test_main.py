@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ppo_dap.study.figures.data import BANDED, changes
+from ppo_dap.study.figures.data import changes
+from ppo_dap.study.figures.panels import BANDED
 from ppo_dap.study.plots.drawing import MAIN
 from ppo_dap.study.stats.compare import compare
 from ppo_dap.study.store.studies import make_study
@@ -12,7 +13,7 @@ from study.figures.figures_drawn import REPS, columns, drawn, line
 
 
 def test_fig_6_is_the_mean_of_the_seeds_with_its_student_t_band():
-    study, results, found = drawn("fig6")
+    study, results, found = drawn("fig6", seeds=range(5))
     length, returns = found["fig6"].axes
     assert ("length" in length.get_title(), "return" in returns.get_title()) == (True, True)
     for axes, column in ((length, "length_mean"), (returns, "return_mean")):
@@ -22,24 +23,24 @@ def test_fig_6_is_the_mean_of_the_seeds_with_its_student_t_band():
             x, y = line(axes, arm).get_data()
             assert x == pytest.approx(np.linspace(0, 1, 41), abs=1e-6)  # in millions of steps
             assert y == pytest.approx(values.mean(0))
-            assert line(axes, arm).get_label() == f"{arm} (n = 3)"
+            assert line(axes, arm).get_label() == f"{arm} (n = 5)"
             if column == "return_mean":
                 edge = axes.collections[place].get_paths()[0].vertices
-                low, high = stats.t.interval(0.95, 2, values.mean(0)[-1], stats.sem(values[:, -1]))
+                low, high = stats.t.interval(0.95, 4, values.mean(0)[-1], stats.sem(values[:, -1]))
                 last = edge[np.isclose(edge[:, 0], 1), 1]
                 assert (last.min(), last.max()) == pytest.approx((low, high))
                 assert axes.get_ylim()[0] < values.min() < values.max() < axes.get_ylim()[1]
     assert "no finished" not in found["fig6"].get_suptitle()
 
 
-def test_fewer_than_three_seeds_are_drawn_and_no_band():
+def test_fewer_than_five_seeds_are_drawn_and_no_band():
     def done(labels):
-        return labels["seed"] < {"PPO": 1, "PPO-DAP": 2, "PPO-DAP (tuned)": 3}.get(labels["arm"], 0)
+        return labels["seed"] < {"PPO": 1, "PPO-DAP": 4, "PPO-DAP (tuned)": 5}.get(labels["arm"], 0)
 
-    study, results, found = drawn("fig6", done=done)
+    study, results, found = drawn("fig6", seeds=range(5), done=done)
     axes = found["fig6"].axes[1]
-    assert BANDED == 3
-    assert len(axes.collections) == 1  # the band of the three seeds of tuned
+    assert BANDED == 5
+    assert len(axes.collections) == 1  # the band of the five seeds of tuned
     thin = [line for line in axes.lines if line.get_linewidth() < 1]
     seeds = [[row["return_mean"] for row in results.curves[r["run"]]] for r in results.rows(study, arm="PPO-DAP")]
     assert [each.get_ydata().tolist() for each in thin] == [pytest.approx(values) for values in seeds]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ppo_dap.study.figures.data import BANDED, Band, Dot
+from ppo_dap.study.figures.data import Band, Dot
 from ppo_dap.study.plots.drawing import GREY, Look, percent, thousands
 
 if TYPE_CHECKING:
@@ -15,12 +15,14 @@ if TYPE_CHECKING:
 
 BOXED = 5
 """Runs from which a box is drawn."""
+BANDED = 5
+"""Runs from which a curve has a band: that of three is 4.3 standard errors to each side and hides all else."""
 
 
 def curves(axes: Axes, bands: Mapping[str, Band], look: Mapping[str, Look]) -> None:
     """A line a name, the mean, with its band, or with a thin line a seed where there are fewer than `BANDED`.
 
-    The axis spans the seeds: a band of three seeds can be far wider, and is cut off.
+    The axis spans the seeds: a band can be far wider, and is cut off.
     """
     scale = thousands(axes, max(band.steps[-1] for band in bands.values()))
     for number, (name, band) in enumerate(bands.items()):
