@@ -126,6 +126,9 @@ class ObjectiveConfig:
     """Weight of the imitation of proposals (Table 2)."""
     lambda_decay: float | None = None
     """Fraction of the run at which all these weights have decayed linearly to 0; None keeps them constant."""
+    std_floor: float = 0.0
+    """KL and imitation leave the policy's standard deviations alone, in scaled actions, where they are at or below it;
+    0 is Eq. 9, whose terms make a policy that seeks its own mode all but deterministic."""
     lambda_awr: float = 0.0
     """Weight of advantage-weighted imitation of the policy's own fresh actions (PPO + AWR/AWAC-aux)."""
     awr_temperature: float = 1.0
@@ -285,7 +288,7 @@ _RULES: dict[str, Rule] = {
     ),
     **dict.fromkeys(
         ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "lambda_awr", "pet_frequency",
-         "eval_every", "q_pessimism", "mode_seeking", "prior_return_weight", "contest_kl_weight"),
+         "eval_every", "q_pessimism", "mode_seeking", "std_floor", "prior_return_weight", "contest_kl_weight"),
         AT_LEAST_0,
     ),
     "seed": (lambda v: 0 <= v < 2**32, "a number from 0 to 4294967295"),

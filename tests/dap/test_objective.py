@@ -90,6 +90,18 @@ def test_gradient_is_the_finite_difference_in_every_parameter(actor):
     assert (np.asarray(gradient) != 0).all()
 
 
+@pytest.mark.parametrize(("floor", "moved"), [(0.0, [1, 1]), (0.5, [0, 1]), (0.9, [0, 0])])
+def test_spreads_at_or_below_the_floor_are_left_alone_and_the_means_moved_as_before(actor, floor, moved):
+    actor = changed(actor, log_std=jnp.log(jnp.asarray([0.5, 0.8])))
+    weights, config = weights_of(0.7, 1.3), ObjectiveConfig(std_floor=floor)
+    both, told = gradient_of(actor, gated_of(), weights)
+    gradient, metrics = jax.jit(partial(added_gradient, config=config))(actor, ROWS, gated_of(), weights)
+    assert np.asarray(both.log_std).all()
+    np.testing.assert_allclose(gradient.log_std, both.log_std * np.asarray(moved), rtol=1e-5)
+    np.testing.assert_allclose(*(ravel_pytree(g.mlp)[0] for g in (gradient, both)), rtol=1e-4, atol=1e-6)
+    assert float(metrics["kl_loss"]) == pytest.approx(float(told["kl_loss"]), rel=1e-5)
+
+
 def test_weights_are_linear_and_switch_their_term_off(actor):
     def gradient(kl, aux):
         return np.asarray(ravel_pytree(gradient_of(actor, gated_of(), weights_of(kl, aux))[0])[0])

@@ -64,19 +64,20 @@ def admit_proposals(proposals: Proposals, batch: Batch) -> GatedProposals:
 
 
 def proposal_terms(
-    actor: Actor, gated: GatedProposals, weights: Weights
+    actor: Actor, gated: GatedProposals, weights: Weights, std_floor: float = 0.0
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The last two terms of Eq. 9, to be minimised, as means over the gated states.
 
     lambda_KL E[KL(pi || proxy)] + lambda_aux E[-log pi(a | s)]. Proposals and proxy are numbers here: no gradient
-    can reach the prior.
+    can reach the prior. A standard deviation of the policy at or below `std_floor` is a number too.
     """
+    log_std = jnp.where(jnp.exp(actor.log_std) > std_floor, actor.log_std, jax.lax.stop_gradient(actor.log_std))
     proposals, gate = jax.lax.stop_gradient((gated.proposals, gated.gate))
     means = actor(proposals.observations)
-    kl = gaussian_kl(means, actor.log_std[None], proposals.proxy_mean, jnp.log(proposals.proxy_std))
+    kl = gaussian_kl(means, log_std[None], proposals.proxy_mean, jnp.log(proposals.proxy_std))
     kl_loss = weighted_mean(kl, gate)
     repeated = jnp.broadcast_to(means[:, None, :], proposals.actions.shape)
-    nll = -jnp.mean(log_prob(proposals.actions, repeated, actor.log_std), axis=1)
+    nll = -jnp.mean(log_prob(proposals.actions, repeated, log_std), axis=1)
     aux_loss = weighted_mean(nll, gate)
     loss = weights.lambda_kl * kl_loss + weights.lambda_aux * aux_loss
     return loss, {"kl_loss": kl_loss, "aux_loss": aux_loss}
@@ -100,7 +101,7 @@ def added_terms(
     """All that a method adds to PPO's objective, to be minimised; without proposals (`()`) their terms are left out."""
     loss, metrics = jnp.zeros(()), {}
     if not isinstance(gated, tuple):
-        loss, metrics = proposal_terms(actor, gated, weights)
+        loss, metrics = proposal_terms(actor, gated, weights, config.std_floor)
     if config.lambda_awr > 0:
         metrics["awr_loss"] = advantage_weighted_loss(actor, rows, config.awr_temperature, config.awr_weight_cap)
         loss = loss + weights.lambda_awr * metrics["awr_loss"]
