@@ -194,6 +194,7 @@ def test_a_bad_batch_is_refused_in_one_line_and_changes_nothing(prior, batch, na
         ({"preset": "papers"}, "papers'.*paper"),
         ({"beta_max": -1.0}, "beta_max must be"),
         ({"mode_seeking": 0.5}, "mode_seeking 0.5 needs this package's own PPO: a Guide has 0.0"),
+        ({"std_floor": 0.3}, "std_floor 0.3 needs this package's own PPO: a Guide has 0.0"),
         ({"preset": "tuned", "q_target": "gae"}, "q_target 'gae' needs this package's own PPO: a Guide has 'td'"),
     ],
 )

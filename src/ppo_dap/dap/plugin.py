@@ -33,7 +33,9 @@ from ppo_dap.nets.policy import scale_actions
 from ppo_dap.ppo.update import draw_orders
 from ppo_dap.priors import Prior
 
-_WITHOUT_OUR_PPO = {"q_target": "td", "q_calibration": "none", "guidance_gate": False, "mode_seeking": 0.0}
+_WITHOUT_OUR_PPO = {
+    "q_target": "td", "q_calibration": "none", "guidance_gate": False, "mode_seeking": 0.0, "std_floor": 0.0,
+}  # fmt: skip
 """What needs the advantages or the policy, which a Guide is not given; a preset that has it is used without."""
 
 
