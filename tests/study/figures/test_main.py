@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from ppo_dap.study.figures.data import changes
-from ppo_dap.study.figures.panels import BANDED
+from ppo_dap.study.figures.panels import SHADED
 from ppo_dap.study.plots.drawing import MAIN
 from ppo_dap.study.stats.compare import compare
 from ppo_dap.study.store.studies import make_study
@@ -39,7 +39,7 @@ def test_fewer_than_five_seeds_are_drawn_and_no_band():
 
     study, results, found = drawn("fig6", seeds=range(5), done=done)
     axes = found["fig6"].axes[1]
-    assert BANDED == 5
+    assert SHADED == 5
     assert len(axes.collections) == 1  # the band of the five seeds of tuned
     thin = [line for line in axes.lines if line.get_linewidth() < 1]
     seeds = [[row["return_mean"] for row in results.curves[r["run"]]] for r in results.rows(study, arm="PPO-DAP")]

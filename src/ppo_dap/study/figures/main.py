@@ -75,7 +75,7 @@ def fig6(results: Results, study: Study) -> Drawn:
             }
             panels.curves(axes, {name: band(runs, column) for name, runs in own.items() if runs}, look)
             axes.set(title=f"{title}, {task}")
-    note = f"mean with 95% Student-t interval; a thin line a seed where there are fewer than {panels.BANDED} seeds"
+    note = f"mean with 95% Student-t interval; a thin line a seed where there are fewer than {panels.SHADED} seeds"
     head(figure, study.title, absent(study, rows), note)
     # The number of seeds may differ from task to task: it stands in the first panel's legend for the first task alone.
     for axes in grid[:, 0] if len(found) > 1 else ():

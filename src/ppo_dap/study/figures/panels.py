@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 BOXED = 5
 """Runs from which a box is drawn."""
-BANDED = 5
+SHADED = 5
 """Runs from which a curve has a band: that of three is 4.3 standard errors to each side and hides all else."""
 
 
 def curves(axes: Axes, bands: Mapping[str, Band], look: Mapping[str, Look]) -> None:
-    """A line a name, the mean, with its band, or with a thin line a seed where there are fewer than `BANDED`.
+    """A line a name, the mean, with its band, or with a thin line a seed where there are fewer than `SHADED`.
 
     The axis spans the seeds: a band can be far wider, and is cut off.
     """
@@ -33,7 +33,7 @@ def curves(axes: Axes, bands: Mapping[str, Band], look: Mapping[str, Look]) -> N
             scale(band.steps), band.mean, linewidth=1.5, label=f"{name} (n = {n})", marker=look[name].mark, ms=4,
             markevery=places, **style,
         )  # fmt: skip
-        if n >= BANDED:
+        if n >= SHADED:
             low, high = band.mean - band.half_width, band.mean + band.half_width
             axes.fill_between(scale(band.steps), low, high, color=style["color"], alpha=0.15, linewidth=0)
         elif n > 1:

@@ -55,7 +55,7 @@ def alc(evaluations: Sequence[Mapping[str, Any]], epochs: float = 40) -> float:
 def late_return(evaluations: Sequence[Mapping[str, Any]]) -> float:
     """Mean of the evaluations in the last tenth of a run's steps: of more episodes than the last evaluation alone.
 
-    Learning rates are near 0 by then, so these policies are almost one. Raises `ValueError` where there is none.
+    Learning rates are at most a tenth by then, so these policies differ little. Raises `ValueError` without any.
     """
     if not evaluations:
         raise ValueError("a run without evaluations has no return")
