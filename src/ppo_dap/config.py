@@ -125,7 +125,8 @@ class ObjectiveConfig:
     lambda_aux: float = 1e-2
     """Weight of the imitation of proposals (Table 2)."""
     lambda_decay: float | None = None
-    """Fraction of the run at which all these weights have decayed linearly to 0; None keeps them constant."""
+    """Fraction of the run at which all these weights have decayed linearly to 0, after which the run is PPO alone; None
+    keeps them constant."""
     std_floor: float = 0.0
     """KL and imitation leave the policy's standard deviations alone, in scaled actions, where they are at or below it;
     0 is Eq. 9, whose terms make a policy that seeks its own mode all but deterministic."""

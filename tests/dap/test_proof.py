@@ -19,7 +19,7 @@ from ppo_dap.dap import audit, objective
 from ppo_dap.dap.dataflow import Flow
 from ppo_dap.dap.objective import proposal_terms
 from ppo_dap.training import proof
-from ppo_dap.training.algorithm import Stages, adds
+from ppo_dap.training.algorithm import Stages
 
 RATIO, ADVANTAGES, V, PET, POLICY, REST = [row[1] for row in audit.FORBIDDEN]
 
@@ -123,8 +123,8 @@ def test_plain_ppo_with_advantage_weighted_imitation_is_proved_too():
     claims = proof.prove(*arguments)
     assert {claim.statement for claim in claims} == {RATIO, ADVANTAGES, V, POLICY, REST}
     assert violated(claims) == set()
-    assert adds(config, guided=False)
-    assert not adds(small_config(), guided=False)
+    assert Stages(config, guided=False).adds
+    assert not Stages(small_config(), guided=False).adds
 
 
 def test_a_leak_is_found_with_advantage_weighted_imitation_too(frozen):

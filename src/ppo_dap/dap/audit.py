@@ -223,6 +223,12 @@ def static_claims(full: Flow, cut: Flow) -> list[Claim]:
     return claims
 
 
+def both(first: Sequence[Claim], then: Sequence[Claim]) -> list[Claim]:
+    """Claims on two traced programs, of which a run has one after the other: the one that fails, if one does."""
+    later = {claim.statement: claim for claim in then}
+    return [later.get(claim.statement, claim) if claim.holds else claim for claim in first]
+
+
 def _worst(rows: Iterable[Mapping[str, Any]], name: str, largest: bool) -> float | None:
     values = [row[name] for row in rows if row.get(name) is not None]
     if any(math.isnan(value) for value in values):
@@ -263,17 +269,20 @@ MEASURED: tuple[tuple[str, str, str, bool, Callable[[float], bool], str], ...] =
 
 
 def measured_claims(
-    metrics: Sequence[Mapping[str, Any]], guided: bool = True, adapted: bool | None = None
+    metrics: Sequence[Mapping[str, Any]], guided: bool = True, adapted: bool | None = None, in_use: int | None = None
 ) -> list[Claim]:
     """Definition 1 on what was logged: the worst value over all iterations counts; what is missing does not hold.
 
-    `guided` runs have a prior, `adapted` ones (all guided ones, unless it says no) tune it.
+    `guided` runs have a prior, `adapted` ones (all guided ones, unless it says no) tune it; the prior was in use in the
+    first `in_use` iterations (all, unless it is given), until its weights had decayed.
     """
     has = {"": True, "guided": guided, "adapted": guided if adapted is None else adapted}
     claims = []
     for clause, statement, name, largest, right, whose in MEASURED:
         if has[whose]:
-            worst = _worst(metrics, name, largest)
-            evidence = "was not logged" if worst is None else f"{worst:.3g} over {len(metrics)} iterations"
-            claims.append(Claim(clause, statement, worst is not None and bool(right(worst)), evidence))
+            worst, logged = _worst(metrics, name, largest), [row.get(name) is not None for row in metrics]
+            absent = (logged[:in_use] if whose else logged).count(False)
+            evidence = "was not logged" if worst is None else f"{worst:.3g} over {sum(logged)} iterations"
+            evidence += f", not logged in {absent}" if worst is not None and absent else ""
+            claims.append(Claim(clause, statement, worst is not None and not absent and bool(right(worst)), evidence))
     return claims

@@ -25,6 +25,11 @@ class Weights(NamedTuple):
     lambda_awr: Float[Array, ""]
 
 
+def weights_left(env_steps: int, steps: int, lambda_decay: float | None) -> float:
+    """Factor of all weights of Eq. 9 after `env_steps` of `steps`: linear from 1 to 0 at `lambda_decay`."""
+    return 1.0 if lambda_decay is None else max(0.0, 1 - min(1.0, env_steps / steps) / lambda_decay)
+
+
 class GatedProposals(eqx.Module):
     """Proposals with the gate that each has passed (1) or not (0)."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -57,6 +58,10 @@ class Learner(eqx.Module):
     previous: Rollout | None = None
     """The batch before, for PPO-ARC alone."""
 
+    def alone(self) -> Learner:
+        """Without a guide."""
+        return Learner(self.ppo, None, self.previous)
+
 
 class Frozen(NamedTuple):
     """The prior as Stage I left it, what it is asked for, and the offline minibatch of the leakage audit."""
@@ -89,8 +94,11 @@ class Stages:
     """The stages of an iteration as jitted functions of arrays, for one configuration, with a guide or without."""
 
     def __init__(self, config: Config, guided: bool):
+        self._ppo = config.ppo
+        self.adds = guided or config.objective.lambda_awr > 0
+        """Whether something is added to PPO's objective."""
         self.advantages = jax.jit(partial(_advantages, config=config))
-        added = partial(added_gradient, config=config.objective) if adds(config, guided) else None
+        added = partial(added_gradient, config=config.objective) if self.adds else None
         self.actor = jax.jit(partial(improve_actor, ppo=config.ppo, added_gradient=added))
         self.critic = jax.jit(partial(improve_critic, ppo=config.ppo))
         self.policy_metrics = jax.jit(audit.policy_metrics)
@@ -108,10 +116,11 @@ class Stages:
             self.leakage = jax.jit(partial(audit.leakage, config=config))
             self.prior_metrics = jax.jit(partial(audit.prior_metrics, config=config.proposals))
 
-
-def adds(config: Config, guided: bool) -> bool:
-    """Whether a method adds something to PPO's objective."""
-    return guided or config.objective.lambda_awr > 0
+    def alone(self) -> Stages:
+        """PPO's, with nothing added; what both have are the same functions, so that nothing is compiled twice."""
+        alone = copy.copy(self)
+        alone.adds, alone.actor = False, jax.jit(partial(improve_actor, ppo=self._ppo, added_gradient=None))
+        return alone
 
 
 def _advantages(

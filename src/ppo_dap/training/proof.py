@@ -15,7 +15,7 @@ from ppo_dap.dap.objective import Weights
 from ppo_dap.nets.arrays import on_device
 from ppo_dap.ppo.rollout import Rollout
 from ppo_dap.ppo.update import Normaliser, PPOState, Settings
-from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, adds, call, iterate
+from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, call, iterate
 from ppo_dap.training.draws import draw, num_parts
 
 
@@ -33,7 +33,7 @@ def prove(
         "ppo_optimizers": (learner.ppo.actor_optimizer, learner.ppo.critic_optimizer),
         "on_policy": (example_rollout(config, *sizes), np.float32(1)),
         "normaliser": Normaliser(np.zeros(sizes[0], np.float32), np.ones(sizes[0], np.float32)),  # type: ignore[arg-type]
-        "schedule": example_schedule(config, guided=learner.guide is not None),
+        "schedule": example_schedule(stages.adds),
         "draws": draw(config, 0, None if frozen is None else frozen.prior),
         "previous": learner.previous,
     }
@@ -84,9 +84,8 @@ def example_rollout(config: Config, observation_size: int, action_size: int) -> 
     return [Rollout(state_ids=np.zeros(grid, np.int32), **wide, **flags, **scalars)] * parts  # type: ignore[arg-type]
 
 
-def example_schedule(config: Config, guided: bool) -> Schedule:
+def example_schedule(added: bool) -> Schedule:
     """A schedule of zeros, for tracing."""
     zero, none = on_device(0), on_device(0, np.int32)
-    added = adds(config, guided)
     settings = Settings(zero, zero, on_device(added, bool), Weights(zero, zero, zero) if added else ())
     return Schedule(none, settings, zero, none)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from ppo_dap import config as configs
 from ppo_dap.config import Config
 from ppo_dap.dap import audit
+from ppo_dap.dap.objective import weights_left
 from ppo_dap.errors import InputError
 from ppo_dap.logs import Logs, load_logs, require_compatible
 from ppo_dap.logs.check import family
@@ -73,7 +74,11 @@ class Run:
             raise InputError(f"{self.folder} has no audit.json: is it a run folder?")
         static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
         guided, config = self.config["prior_hash"] is not None, self.config["config"]
-        return static + audit.measured_claims(self.metrics, guided, guided and config["pet_frequency"] > 0)
+        rows = self.metrics
+        starts = [0, *(row["env_steps"] for row in rows[:-1])]
+        # Runs of before there was a decay have none.
+        in_use = sum(weights_left(s, config["steps"], config.get("lambda_decay")) > 0 for s in starts[: len(rows)])
+        return static + audit.measured_claims(rows, guided, guided and config["pet_frequency"] > 0, in_use)
 
     def verdict(self) -> tuple[bool, bool]:
         """Whether the run was strictly on-policy, and whether that is what its method's row says it is."""
@@ -166,19 +171,26 @@ def _make_trainer(
     if resume and checkpoint.is_file():
         state, run = load_checkpoint(checkpoint, state)
         lines = run["lines"]
+        left = weights_left(state.env_steps, config.run.steps, config.objective.lambda_decay)
+        if frozen is not None and state.learner.guide is None and left:
+            raise InputError(f"{checkpoint} has no guide, which the run still needs: was it another config?")
     elif logs is not None:
         state = warm_start(state, logs, spec, config)
     stages = Stages(config, guided=frozen is not None)
     ahead = CompileAhead()
     claims = prove(learner, frozen, config, stages, ahead.trace)
+    alone = stages.alone()
+    if stages.adds and config.objective.lambda_decay is not None:
+        claims = audit.both(claims, prove(learner.alone(), None, config, alone, ahead.trace))
     if lines is None:
         write_atomically(folder / "config.json", json.dumps(description | manifest(), indent=1).encode())
     recorder = Recorder(folder, config.run.tensorboard, lines)
     label = f"{spec.task} {description['method']} seed {config.run.seed}"
     bar = make_progress(label, config.run.steps, state.env_steps, show)
     return Trainer(
-        config, spec, state, frozen, stages, folder, {"task": spec.task}, claims, recorder, bar, before_first=ahead.wait
-    )
+        config, spec, state, frozen, stages, alone, folder, {"task": spec.task}, claims, recorder, bar,
+        before_first=ahead.wait,
+    )  # fmt: skip
 
 
 def _check_prior(method: Method, prior: Any, spec: TaskSpec) -> Prior | None:

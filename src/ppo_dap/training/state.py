@@ -56,10 +56,13 @@ def save_checkpoint(path: Path, state: TrainState, run: dict[str, Any]) -> None:
 def load_checkpoint(path: Path, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
     """State of the checkpoint at `path`, shaped as `like`, and which run it belongs to.
 
+    A run that went on without its guide has none in its later checkpoints; then nor has the state.
+
     Raises `InputError` for a file that is no checkpoint, is damaged, newer, or of other networks.
     """
     tensors, meta = read_tensors(path, kind="checkpoint", newest=FORMAT)
-    learner = tree_from_tensors(like.learner, tensors, "learner", path)
+    guided = any(name.startswith("learner.guide.") for name in tensors)
+    learner = tree_from_tensors(like.learner if guided else like.learner.alone(), tensors, "learner", path)
     moments = {
         key: RunningMoments(float(tensors[f"{key}.count"]), tensors[f"{key}.mean"], tensors[f"{key}.m2"])
         for key in ("observations", "rewards")

@@ -21,14 +21,14 @@ from ppo_dap.dap import audit
 from ppo_dap.dap.adaptation import steps_until
 from ppo_dap.dap.guidance import beta_schedule
 from ppo_dap.dap.guide import recalibrated
-from ppo_dap.dap.objective import Weights
+from ppo_dap.dap.objective import Weights, weights_left
 from ppo_dap.errors import TrainingDiverged
 from ppo_dap.nets.policy import Policy
 from ppo_dap.ppo.rollout import Collector, Rollout
 from ppo_dap.ppo.update import Normaliser, Settings
 from ppo_dap.storage import write_atomically
 from ppo_dap.tasks import TaskSpec, make_vector_env
-from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, adds, iterate
+from ppo_dap.training.algorithm import Frozen, Learner, Schedule, Stages, iterate
 from ppo_dap.training.clock import Clock
 from ppo_dap.training.cores import pinned
 from ppo_dap.training.draws import Draws, draw, num_parts
@@ -62,6 +62,8 @@ class Trainer:
     state: TrainState
     frozen: Frozen | None
     stages: Stages
+    alone: Stages
+    """Those that are left when all weights of what is added have decayed to 0."""
     folder: Path
     identity: dict[str, Any]
     """Which run a checkpoint belongs to."""
@@ -126,14 +128,17 @@ class Trainer:
     def iterate(self, collector: Collector) -> None:
         """One iteration of Algorithm 1. Returns when the actor is there; the last iteration's metrics are recorded."""
         state, config, start = self.state, self.config, time.perf_counter()
+        if self.stages.adds and not self._weights_left():
+            self._go_on_alone()
         parts: list[Rollout] = []
+        schedule = self.schedule()
         state.learner, metrics = iterate(
             self._calibrated(state.learner),
             self.frozen,
             self._collect(collector, parts),
             Normaliser(_array(state.observations.mean), _array(state.observations.std)),
             lambda: self._reward_std(parts),
-            self.schedule(),
+            schedule,
             self._draws(state.iteration),
             self.stages,
             self.clock.dispatch,
@@ -153,9 +158,26 @@ class Trainer:
         state.iteration, state.env_steps = row["iteration"], row["env_steps"]
         with self.clock.host("waiting"):
             jax.block_until_ready(state.learner.ppo.actor)
+        with np.errstate(over="ignore"):  # of a run that diverges, which the next iteration tells
+            row["policy_std"] = float(np.exp(np.asarray(state.learner.ppo.actor.log_std)).mean())
+        if self.frozen is not None:
+            row["beta"] = float(schedule.beta)
         if config.ppo.kl_rule == "reduce_lr":
             self._reduce_lr(float(metrics["policy_kl"]))
         self._pending = Pending(row, metrics, self.clock.turn(), time.perf_counter() - start)
+
+    def _weights_left(self) -> float:
+        return weights_left(self.state.env_steps, self.config.run.steps, self.config.objective.lambda_decay)
+
+    def _go_on_alone(self) -> None:
+        """From here on the run is PPO: what has weight 0 for good need not be computed. A checkpoint keeps the guide.
+
+        Of a run that was resumed after this the guide is gone already.
+        """
+        if self.state.learner.guide is not None:
+            self.checkpoint("guided")
+        self.state.learner, self.frozen, self.stages = self.state.learner.alone(), None, self.alone
+        self._next_draws = None
 
     def _calibrated(self, learner: Learner) -> Learner:
         if learner.guide is None:
@@ -206,12 +228,11 @@ class Trainer:
         progress = min(1.0, state.env_steps / config.run.steps)
         rate = ppo.learning_rate * (1 - progress) * state.learning_rate_scale
         limit = ppo.kl_target if ppo.kl_rule == "stop_epochs" else math.inf
-        decay = 1.0 if objective.lambda_decay is None else max(0.0, 1 - progress / objective.lambda_decay)
         updates = ppo.num_epochs * ppo.rollout_steps // ppo.minibatch_size
         pet = [steps_until(state.iteration + i, config.adaptation.pet_frequency, updates) for i in (0, 1)]
-        added = adds(config, self.frozen is not None)
+        added = self.stages.adds
         lambdas = (objective.lambda_kl, objective.lambda_aux, objective.lambda_awr)
-        weights = Weights(*(_array(weight * decay) for weight in lambdas))
+        weights = Weights(*(_array(weight * self._weights_left()) for weight in lambdas))
         return Schedule(
             _array(state.iteration * ppo.rollout_steps, np.int32),
             Settings(_array(rate), _array(limit), _array(added, np.bool_), weights if added else ()),

@@ -100,16 +100,19 @@ def terms(rows: Sequence[Mapping[str, Any]], anchors: Sequence[Anchor], gamma: f
     """The terms of Eq. 14 between consecutive `anchors`, from the metrics' `rows`.
 
     Returns are divided by `reward_std`; the surrogate is multiplied by 1 / (1 - gamma), which is what makes a mean
-    advantage a difference of discounted returns (A.2, step 1). eta is the root of the Q head's TD loss.
+    advantage a difference of discounted returns (A.2, step 1). eta is the root of the Q head's TD loss. Both terms of
+    the prior are 0 after the last iteration in which it was in use.
 
     Raises `InputError` for metrics that lack a term, or fewer than two anchors.
     """
     if len(anchors) < 2:
         raise InputError(f"{len(anchors)} measured returns in the run: Eq. 14 needs two at least")
     guided = "q_loss" in rows[0]
-    names = ["surrogate", "policy_kl", *(["prior_kl", "q_loss"] if guided else [])]
-    columns = {name: _column(rows, name) for name in names}
+    columns = {name: _column(rows, name) for name in ("surrogate", "policy_kl")}
     if guided:
+        in_use = 1 + max(k for k, row in enumerate(rows) if "q_loss" in row)
+        rest = np.zeros(len(rows) - in_use)
+        columns |= {name: np.append(_column(rows[:in_use], name), rest) for name in ("prior_kl", "q_loss")}
         columns["eta"] = np.sqrt(columns.pop("q_loss"))
     total = {name: np.append(0.0, np.cumsum(values)) for name, values in columns.items()}
     first, last = (np.array([a.update for a in side]) for side in (anchors[:-1], anchors[1:]))

@@ -150,7 +150,8 @@ _make_proposals = jax.jit(make_proposals, static_argnames="config")
 def load_guided(
     folder: str | Path, prior: Prior | str | Path, checkpoint: Literal["last", "best"] = "last"
 ) -> GuidedRun:
-    """Open a run folder at a checkpoint, with the prior that it was trained with.
+    """Open a run folder at a checkpoint, with the prior that it was trained with. Of a run that went on without its
+    guide, `last` is the checkpoint that keeps it.
 
     Raises `InputError` for a method without a prior, another prior than the run's, and a checkpoint that is missing
     or of other networks.
@@ -166,7 +167,12 @@ def load_guided(
     sizes = spec.observation_size, spec.action_size
     learner = create_learner(sizes, config, found.network)
     like = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
-    state, _ = load_checkpoint(run.folder / "checkpoints" / f"{checkpoint}.safetensors", like)
+    kept = run.folder / "checkpoints" / "guided.safetensors"
+    path = kept if checkpoint == "last" and kept.is_file() else kept.with_stem(checkpoint)
+    state, _ = load_checkpoint(path, like)
     if state.learner.guide is None:
-        raise InputError(f"checkpoint {checkpoint} of {folder} has no Q head")
+        raise InputError(
+            f"checkpoint {checkpoint} of {folder} is of {state.env_steps:,} steps, when the run went on without its "
+            "guide: choose checkpoint last, which is the guide's last"
+        )
     return GuidedRun(run, config, spec, state, state.learner.guide, found)

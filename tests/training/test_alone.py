@@ -1,0 +1,137 @@
+"""A run whose weights have decayed goes on as plain PPO, with the bits that it would have had with its guide."""
+
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+import ppo_dap
+from ppo_dap.study.diagnostics.guided_run import load_guided
+from ppo_dap.training import trainer
+from ppo_dap.training.trainer import Trainer
+
+OPTIONS = {"steps": 1500, "lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "progress": False}
+"""12 iterations of up to 128 steps with a checkpoint after each third; the weights are gone after the seventh."""
+IN_USE = 7
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, hopper_prior, small):
+    out = tmp_path_factory.mktemp("alone") / "run"
+    return ppo_dap.train("Hopper-v5", prior=hopper_prior, out=out, **OPTIONS, **small)
+
+
+def learned(run):
+    return load_file(run.folder / "checkpoints" / "last.safetensors")
+
+
+def assert_same(run, other):
+    tensors, expected = learned(run), learned(other)
+    assert tensors.keys() == expected.keys()
+    assert all(tensors[name].tobytes() == expected[name].tobytes() for name in tensors)
+    assert run.evaluations == other.evaluations
+
+
+def test_what_it_learns_is_what_it_learns_with_an_idle_guide(tmp_path, monkeypatch, run, hopper_prior, small):
+    monkeypatch.setattr(Trainer, "_go_on_alone", lambda trainer: None)
+    idle = ppo_dap.train("Hopper-v5", prior=hopper_prior, out=tmp_path / "run", **OPTIONS, **small)
+    assert all(row["spr"] == 1 for row in idle.metrics)
+    theirs, ours = learned(idle), learned(run)
+    assert {name for name in theirs if name not in ours} == {name for name in theirs if "guide" in name} != set()
+    assert all(theirs[name].tobytes() == ours[name].tobytes() for name in ours)
+    assert run.evaluations == idle.evaluations
+    for row, other in zip(run.metrics, idle.metrics, strict=True):
+        same = [name for name in row if not name.startswith(("seconds_", "steps_per_second"))]
+        assert {name: row[name] for name in same} == {name: other[name] for name in same}
+
+
+def test_its_tables_end_with_the_guide_and_the_audit_knows(run):
+    steps = [row["env_steps"] for row in run.metrics]
+    assert steps[IN_USE - 2] < 750 <= steps[IN_USE - 1] < steps[-1]
+    for name in ("spr", "q_loss", "pet_spr", "oglr", "kl_loss"):
+        assert [name in row for row in run.metrics] == [True] * IN_USE + [False] * (len(steps) - IN_USE)
+    assert all(row["batch_fresh"] == 1 for row in run.metrics)
+    claims = {claim.statement: claim for claim in run.audit()}
+    assert all(claim.holds for claim in claims.values())
+    assert claims["SPR, smallest"].evidence == f"1 over {IN_USE} iterations"
+
+
+def test_every_row_has_the_policys_spread_and_the_temperature_of_what_guides_it(run):
+    spread = np.exp(load_file(run.folder / "policy.safetensors")["log_std"].astype(float)).mean()
+    assert run.metrics[-1]["policy_std"] == pytest.approx(spread, rel=1e-6)
+    assert len({row["policy_std"] for row in run.metrics}) == len(run.metrics)
+    anneal, starts = run.config["config"]["beta_anneal"], [0, *(row["env_steps"] for row in run.metrics)]
+    betas = np.interp(starts[:IN_USE], [0, anneal * OPTIONS["steps"]], [0, run.config["config"]["beta_max"]])
+    assert [row["beta"] for row in run.metrics[:IN_USE]] == pytest.approx(betas)
+    assert not any("beta" in row for row in run.metrics[IN_USE:])
+
+
+def test_a_guide_that_fell_silent_too_soon_is_found(tmp_path, run):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("config.json", "audit.json"):
+        (folder / name).write_bytes((run.folder / name).read_bytes())
+    rows = run.metrics
+    del rows[IN_USE - 1]["spr"]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert [claim.statement for claim in ppo_dap.load_run(folder).audit() if not claim.holds] == ["SPR, smallest"]
+
+
+def test_the_last_checkpoint_of_the_guide_is_kept(run, hopper_prior):
+    guided = load_guided(run.folder, hopper_prior)
+    assert guided.state.iteration == IN_USE
+    assert guided.guide.adapters is not None
+    late = run.folder / "checkpoints" / "best.safetensors"
+    before = late.read_bytes()
+    late.write_bytes((run.folder / "checkpoints" / "last.safetensors").read_bytes())
+    steps = run.metrics[-1]["env_steps"]
+    with pytest.raises(ppo_dap.InputError, match=f"is of {steps:,} steps, when the run went on without its guide"):
+        load_guided(run.folder, hopper_prior, "best")
+    late.write_bytes(before)
+
+
+@pytest.mark.parametrize("lost", [3, 4])
+def test_it_resumes_from_before_and_from_after(tmp_path, monkeypatch, run, hopper_prior, small, lost):
+    """The third checkpoint, which is lost, and so the second, from which the run goes on, are to either side."""
+    save, calls = trainer.save_checkpoint, []
+
+    def failing(path, *arguments):
+        calls.extend([path] if path.name == "last.safetensors" else [])
+        if len(calls) == lost:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(path, *arguments)
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "save_checkpoint", failing)
+        with pytest.raises(OSError, match="No space left"):
+            ppo_dap.train("Hopper-v5", prior=hopper_prior, out=out, **OPTIONS, **small)
+    assert any("guide" in name for name in load_file(out / "checkpoints" / "last.safetensors")) == (lost == 3)
+    resumed = ppo_dap.train("Hopper-v5", prior=hopper_prior, out=out, resume=True, **OPTIONS, **small)
+    assert_same(resumed, run)
+    assert load_guided(out, hopper_prior).state.iteration == IN_USE
+
+
+def test_a_checkpoint_without_the_guide_that_is_still_needed(tmp_path, hopper_prior, small):
+    options = {**OPTIONS, **small, "steps": 384}
+    plain = ppo_dap.train("Hopper-v5", "ppo", out=tmp_path / "ppo", steps=384, progress=False, **small)
+    late = {"lambda_decay": None}
+    run = ppo_dap.train("Hopper-v5", prior=hopper_prior, out=tmp_path / "run", **options | late)
+    path = run.folder / "checkpoints" / "last.safetensors"
+    path.write_bytes((plain.folder / "checkpoints" / "last.safetensors").read_bytes())
+    with pytest.raises(ppo_dap.InputError, match="has no guide, which the run still needs"):
+        ppo_dap.train("Hopper-v5", prior=hopper_prior, out=run.folder, resume=True, **options | late)
+
+
+def test_imitation_of_its_own_actions_ends_as_well(tmp_path, small):
+    options = {**small, "steps": 768, "progress": False, "lambda_decay": 0.5}
+    run = ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "run", **options)
+    logged = ["awr_loss" in row for row in run.metrics]
+    left = [True, *(row["env_steps"] < 384 for row in run.metrics[:-1])]
+    assert logged == left
+    assert not all(left)
+    assert not list(run.folder.glob("checkpoints/guided*"))
+    assert all(claim.holds for claim in run.audit())
