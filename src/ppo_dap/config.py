@@ -127,6 +127,8 @@ class ObjectiveConfig:
     lambda_decay: float | None = None
     """Fraction of the run at which all these weights have decayed linearly to 0, after which the run is PPO alone; None
     keeps them constant."""
+    lambda_decay_steps: int | None = None
+    """Environment steps after which they are 0 at the latest, however long the run; None sets no limit."""
     std_floor: float = 0.0
     """KL and imitation leave the policy's standard deviations alone, in scaled actions, where they are at or below it;
     0 is Eq. 9, whose terms make a policy that seeks its own mode all but deterministic."""
@@ -236,7 +238,8 @@ class Config:
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "tuned": {
-        "lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "kl_rule": "monitor", "mode_seeking": 1.0,
+        "lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "lambda_decay_steps": 100_000, "kl_rule": "monitor",
+        "mode_seeking": 1.0, "std_floor": 0.5,
     },
     "tuned-warm": {
         "lambda_kl": 0.2, "lambda_aux": 0.0, "lambda_decay": 0.5, "kl_rule": "monitor",
@@ -298,7 +301,7 @@ _RULES: dict[str, Rule] = {
     "clip_slope": (lambda v: -1 <= v <= 1, "a number from -1 to 1"),
     "reuse_batches": (lambda v: 0 <= v <= 1, "a number from 0 to 1"),
     **dict.fromkeys(
-        ("displacement_cap", "top_k", "keep_diverse", "boundary_kl"),
+        ("displacement_cap", "top_k", "keep_diverse", "boundary_kl", "lambda_decay_steps"),
         (lambda v: v is None or v > 0, "a number above 0, or None"),
     ),
     "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),

@@ -9,6 +9,7 @@ import pytest
 from safetensors.numpy import load_file
 
 import ppo_dap
+from ppo_dap.dap.objective import weights_left
 from ppo_dap.study.diagnostics.guided_run import load_guided
 from ppo_dap.training import trainer
 from ppo_dap.training.trainer import Trainer
@@ -124,6 +125,25 @@ def test_a_checkpoint_without_the_guide_that_is_still_needed(tmp_path, hopper_pr
     path.write_bytes((plain.folder / "checkpoints" / "last.safetensors").read_bytes())
     with pytest.raises(ppo_dap.InputError, match="has no guide, which the run still needs"):
         ppo_dap.train("Hopper-v5", prior=hopper_prior, out=run.folder, resume=True, **options | late)
+
+
+@pytest.mark.parametrize(
+    ("share", "most", "end"), [(0.5, None, 750), (0.5, 400, 400), (0.1, 400, 150), (None, 400, 400)]
+)
+def test_weights_fall_in_a_line_to_the_first_of_both_ends(share, most, end):
+    steps = np.arange(0, 1500, 50)
+    left = [weights_left(int(done), 1500, share, most) for done in steps]
+    assert left == pytest.approx(np.interp(steps, [0, end], [1, 0]))
+    assert weights_left(1400, 1500, None, None) == 1
+
+
+def test_a_limit_in_steps_ends_a_run_of_any_length(tmp_path, small):
+    options = {**small, "progress": False, "lambda_decay_steps": 256}
+    for steps in (512, 768):
+        run = ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / str(steps), steps=steps, **options)
+        left = [True, *(row["env_steps"] < 256 for row in run.metrics[:-1])]
+        assert ["awr_loss" in row for row in run.metrics] == left
+        assert sum(left) < len(left)
 
 
 def test_imitation_of_its_own_actions_ends_as_well(tmp_path, small):

@@ -25,9 +25,11 @@ class Weights(NamedTuple):
     lambda_awr: Float[Array, ""]
 
 
-def weights_left(env_steps: int, steps: int, lambda_decay: float | None) -> float:
-    """Factor of all weights of Eq. 9 after `env_steps` of `steps`: linear from 1 to 0 at `lambda_decay`."""
-    return 1.0 if lambda_decay is None else max(0.0, 1 - min(1.0, env_steps / steps) / lambda_decay)
+def weights_left(env_steps: int, steps: int, lambda_decay: float | None, lambda_decay_steps: int | None) -> float:
+    """Factor of all weights of Eq. 9 after `env_steps` of `steps`: linear from 1 to 0 at the first of both ends."""
+    shares = lambda_decay, None if lambda_decay_steps is None else lambda_decay_steps / steps
+    end = min((share for share in shares if share is not None), default=None)
+    return 1.0 if end is None else max(0.0, 1 - min(1.0, env_steps / steps) / end)
 
 
 class GatedProposals(eqx.Module):

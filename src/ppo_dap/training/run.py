@@ -76,8 +76,8 @@ class Run:
         guided, config = self.config["prior_hash"] is not None, self.config["config"]
         rows = self.metrics
         starts = [0, *(row["env_steps"] for row in rows[:-1])]
-        # Runs of before there was a decay have none.
-        in_use = sum(weights_left(s, config["steps"], config.get("lambda_decay")) > 0 for s in starts[: len(rows)])
+        ends = config.get("lambda_decay"), config.get("lambda_decay_steps")  # of earlier versions: not there
+        in_use = sum(weights_left(start, config["steps"], *ends) > 0 for start in starts[: len(rows)])
         return static + audit.measured_claims(rows, guided, guided and config["pet_frequency"] > 0, in_use)
 
     def verdict(self) -> tuple[bool, bool]:
@@ -166,12 +166,13 @@ def _make_trainer(
         frozen = Frozen(prior.network, on_device(condition), probe)
     learner = create_learner(sizes, config, None if frozen is None else frozen.prior)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
+    ends = config.objective.lambda_decay, config.objective.lambda_decay_steps
     lines = None
     checkpoint = folder / "checkpoints" / "last.safetensors"
     if resume and checkpoint.is_file():
         state, run = load_checkpoint(checkpoint, state)
         lines = run["lines"]
-        left = weights_left(state.env_steps, config.run.steps, config.objective.lambda_decay)
+        left = weights_left(state.env_steps, config.run.steps, *ends)
         if frozen is not None and state.learner.guide is None and left:
             raise InputError(f"{checkpoint} has no guide, which the run still needs: was it another config?")
     elif logs is not None:
@@ -180,7 +181,7 @@ def _make_trainer(
     ahead = CompileAhead()
     claims = prove(learner, frozen, config, stages, ahead.trace)
     alone = stages.alone()
-    if stages.adds and config.objective.lambda_decay is not None:
+    if stages.adds and weights_left(config.run.steps, config.run.steps, *ends) == 0:
         claims = audit.both(claims, prove(learner.alone(), None, config, alone, ahead.trace))
     if lines is None:
         write_atomically(folder / "config.json", json.dumps(description | manifest(), indent=1).encode())

@@ -167,7 +167,9 @@ class Trainer:
         self._pending = Pending(row, metrics, self.clock.turn(), time.perf_counter() - start)
 
     def _weights_left(self) -> float:
-        return weights_left(self.state.env_steps, self.config.run.steps, self.config.objective.lambda_decay)
+        objective = self.config.objective
+        ends = objective.lambda_decay, objective.lambda_decay_steps
+        return weights_left(self.state.env_steps, self.config.run.steps, *ends)
 
     def _go_on_alone(self) -> None:
         """From here on the run is PPO: what has weight 0 for good need not be computed. A checkpoint keeps the guide.
