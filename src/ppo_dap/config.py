@@ -239,7 +239,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "tuned": {
         "lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "lambda_decay_steps": 100_000, "kl_rule": "monitor",
-        "mode_seeking": 1.0, "std_floor": 0.5,
+        "mode_seeking": 1.0,
     },
     "tuned-warm": {
         "lambda_kl": 0.2, "lambda_aux": 0.0, "lambda_decay": 0.5, "kl_rule": "monitor",

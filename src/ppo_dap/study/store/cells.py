@@ -173,7 +173,14 @@ def run(
     settings = {"task": spec.task, "method": chosen.name, "preset": preset, **flat}
     if prior == RANDOM:
         settings["prior"] = RANDOM
-    return Cell("run", settings, needs, _resolved("ppo", "paper", None, None, ()), options)
+    return Cell("run", settings, needs, _resolved("ppo", "paper", None, None, ()) | _unfelt(flat), options)
+
+
+def _unfelt(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """A limit that this run does not reach: it is made as without, and so has the name that it has without."""
+    share, limit = flat["lambda_decay"], flat["lambda_decay_steps"]
+    unfelt = limit is not None and share is not None and share * flat["steps"] <= limit
+    return {"lambda_decay_steps": limit} if unfelt else {}
 
 
 def reliability(of: Cell, states: int, rollouts: int, horizon: int | None = None, seed: int = 0) -> Cell:
