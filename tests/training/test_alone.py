@@ -1,5 +1,6 @@
 """A run whose weights have decayed goes on as plain PPO, with the bits that it would have had with its guide."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -11,6 +12,7 @@ from safetensors.numpy import load_file
 import ppo_dap
 from ppo_dap.dap.objective import weights_left
 from ppo_dap.study.diagnostics.guided_run import load_guided
+from ppo_dap.training import run as run_module
 from ppo_dap.training import trainer
 from ppo_dap.training.trainer import Trainer
 
@@ -79,6 +81,24 @@ def test_a_guide_that_fell_silent_too_soon_is_found(tmp_path, run):
     del rows[IN_USE - 1]["spr"]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     assert [claim.statement for claim in ppo_dap.load_run(folder).audit() if not claim.holds] == ["SPR, smallest"]
+
+
+@pytest.mark.parametrize("leaking", ["guided", "alone"])
+def test_a_leak_in_either_update_is_found(tmp_path, monkeypatch, hopper_prior, small, leaking):
+    prove = run_module.prove
+
+    def proved(learner, *rest):
+        claims, guilty = prove(learner, *rest), (learner.guide is None) == (leaking == "alone")
+        return [
+            dataclasses.replace(claim, holds=claim.holds and not (guilty and "V and its trunk" in claim.statement))
+            for claim in claims
+        ]
+
+    monkeypatch.setattr(run_module, "prove", proved)
+    options = OPTIONS | {"steps": 256}
+    found = ppo_dap.train("Hopper-v5", prior=hopper_prior, out=tmp_path / "run", **options, **small).audit()
+    assert ["V and its trunk" in claim.statement for claim in found if not claim.holds] == [True]
+    assert len(found) == len({claim.statement for claim in found}) == 11
 
 
 def test_the_last_checkpoint_of_the_guide_is_kept(run, hopper_prior):

@@ -129,6 +129,13 @@ def test_terms_add_up_between_measured_returns():
     assert by_evaluation.noise == pytest.approx([2**0.5 / 2] * 2)
     plain = [{k: v for k, v in row.items() if k not in ("prior_kl", "q_loss")} for row in rows]
     assert list(terms(plain, anchors, 0.75, 2.0).penalties) == ["policy_kl"]
+    # A run that went on without its guide after the third update, and one that lost a row while it had it.
+    alone = terms([*rows[:3], plain[3]], anchors, 0.75, 2.0)
+    assert alone.penalties["policy_kl"] == pytest.approx([0.3, 0.7])
+    assert alone.penalties["prior_kl"] == pytest.approx([0, 1])
+    assert alone.penalties["eta"] == pytest.approx([2 + 3, 4])
+    with pytest.raises(InputError, match="lacks a finite prior_kl"):
+        terms([rows[0], plain[1], *rows[2:]], anchors, 0.75, 2.0)
 
 
 def test_noise_of_returns_on_a_slope(rng):
