@@ -116,7 +116,8 @@ def forest(
     if shared:
         rows = [[name for name in order if any(name in own for own in rows)]] * len(found)
     lines = max(len(own) * max(len(panel.series), 1) for own, panel in zip(rows, found, strict=True))
-    figure = new_figure(1.3 + max(0.13 * lines, 0.2 * max(map(len, rows))))
+    labels = max(sum(0.04 + 0.16 * (1 + name.count("\n")) for name in own) for own in rows)
+    figure = new_figure(1.3 + max(0.13 * lines, labels))
     grid = figure.subplots(1, len(found), squeeze=False)[0]
     for number, (axes, panel, own) in enumerate(zip(grid, found, rows, strict=True)):
         panels.dots(axes, own, panel.series, look, relative=panel.relative)
