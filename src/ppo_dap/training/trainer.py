@@ -174,7 +174,8 @@ class Trainer:
     def _go_on_alone(self) -> None:
         """From here on the run is PPO: what has weight 0 for good need not be computed. A checkpoint keeps the guide.
 
-        Of a run that was resumed after this the guide is gone already.
+        PPO's bits stay what they would be, but for a shared trunk: V then learns without Q. Of a run that was resumed
+        after this the guide is gone already.
         """
         if self.state.learner.guide is not None:
             self.checkpoint("guided")
