@@ -9,6 +9,7 @@ field; `replace` does that. `PRESETS` holds the settings that results are quoted
 from __future__ import annotations
 
 import dataclasses
+import functools
 import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -248,6 +249,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
+@functools.cache
 def field_groups() -> dict[str, str]:
     """Flat field name -> name of its group in `Config`."""
     groups = type_hints(Config)

@@ -151,10 +151,10 @@ def test_a_checkpoint_without_the_guide_that_is_still_needed(tmp_path, hopper_pr
     ("share", "most", "end"), [(0.5, None, 750), (0.5, 400, 400), (0.1, 400, 150), (None, 400, 400)]
 )
 def test_weights_fall_in_a_line_to_the_first_of_both_ends(share, most, end):
-    steps = np.arange(0, 1500, 50)
-    left = [weights_left(int(done), 1500, share, most) for done in steps]
+    steps, ends = np.arange(0, 1500, 50), {"lambda_decay": share, "lambda_decay_steps": most}
+    left = [weights_left(int(done), ends | {"steps": 1500}) for done in steps]
     assert left == pytest.approx(np.interp(steps, [0, end], [1, 0]))
-    assert weights_left(1400, 1500, None, None) == 1
+    assert weights_left(1400, {"steps": 1500, "lambda_decay": None}) == 1
 
 
 def test_a_limit_in_steps_ends_a_run_of_any_length(tmp_path, small):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,9 +26,14 @@ class Weights(NamedTuple):
     lambda_awr: Float[Array, ""]
 
 
-def weights_left(env_steps: int, steps: int, lambda_decay: float | None, lambda_decay_steps: int | None) -> float:
-    """Factor of all weights of Eq. 9 after `env_steps` of `steps`: linear from 1 to 0 at the first of both ends."""
-    shares = lambda_decay, None if lambda_decay_steps is None else lambda_decay_steps / steps
+def weights_left(env_steps: int, flat: Mapping[str, Any]) -> float:
+    """Factor of all weights of Eq. 9 after `env_steps`: linear from 1 to 0 at the first of both ends of the decay.
+
+    Args:
+        flat: The run's settings by name (`config.flatten`); an end that an earlier version did not know is none.
+    """
+    steps, limit = flat["steps"], flat.get("lambda_decay_steps")
+    shares = flat.get("lambda_decay"), None if limit is None else limit / steps
     end = min((share for share in shares if share is not None), default=None)
     return 1.0 if end is None else max(0.0, 1 - min(1.0, env_steps / steps) / end)
 

@@ -76,8 +76,7 @@ class Run:
         guided, config = self.config["prior_hash"] is not None, self.config["config"]
         rows = self.metrics
         starts = [0, *(row["env_steps"] for row in rows[:-1])]
-        ends = config.get("lambda_decay"), config.get("lambda_decay_steps")  # of earlier versions: not there
-        in_use = sum(weights_left(start, config["steps"], *ends) > 0 for start in starts[: len(rows)])
+        in_use = sum(weights_left(start, config) > 0 for start in starts[: len(rows)])
         return static + audit.measured_claims(rows, guided, guided and config["pet_frequency"] > 0, in_use)
 
     def verdict(self) -> tuple[bool, bool]:
@@ -166,14 +165,13 @@ def _make_trainer(
         frozen = Frozen(prior.network, on_device(condition), probe)
     learner = create_learner(sizes, config, None if frozen is None else frozen.prior)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
-    ends = config.objective.lambda_decay, config.objective.lambda_decay_steps
+    flat = configs.flatten(config)
     lines = None
     checkpoint = folder / "checkpoints" / "last.safetensors"
     if resume and checkpoint.is_file():
         state, run = load_checkpoint(checkpoint, state)
         lines = run["lines"]
-        left = weights_left(state.env_steps, config.run.steps, *ends)
-        if frozen is not None and state.learner.guide is None and left:
+        if frozen is not None and state.learner.guide is None and weights_left(state.env_steps, flat):
             raise InputError(f"{checkpoint} has no guide, which the run still needs: was it another config?")
     elif logs is not None:
         state = warm_start(state, logs, spec, config)
@@ -181,7 +179,7 @@ def _make_trainer(
     ahead = CompileAhead()
     claims = prove(learner, frozen, config, stages, ahead.trace)
     alone = stages.alone()
-    if stages.adds and weights_left(config.run.steps, config.run.steps, *ends) == 0:
+    if stages.adds and weights_left(config.run.steps, flat) == 0:
         claims = audit.both(claims, prove(learner.alone(), None, config, alone, ahead.trace))
     if lines is None:
         write_atomically(folder / "config.json", json.dumps(description | manifest(), indent=1).encode())

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ppo_dap.config import Config
+from ppo_dap.config import Config, flatten
 from ppo_dap.dap import audit
 from ppo_dap.dap.adaptation import steps_until
 from ppo_dap.dap.guidance import beta_schedule
@@ -167,9 +167,7 @@ class Trainer:
         self._pending = Pending(row, metrics, self.clock.turn(), time.perf_counter() - start)
 
     def _weights_left(self) -> float:
-        objective = self.config.objective
-        ends = objective.lambda_decay, objective.lambda_decay_steps
-        return weights_left(self.state.env_steps, self.config.run.steps, *ends)
+        return weights_left(self.state.env_steps, flatten(self.config))
 
     def _go_on_alone(self) -> None:
         """From here on the run is PPO: what has weight 0 for good need not be computed. A checkpoint keeps the guide.
