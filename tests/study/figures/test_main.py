@@ -132,7 +132,7 @@ def test_fig_8_compares_methods_on_the_tasks_that_all_have():
 
     study, results, found = drawn("fig8", done=done)
     axes = found["fig8"].axes[1]
-    assert axes.get_title() == "(b) ALC@40: 1 task"
+    assert axes.get_title() == "(b) ALC@40: Hopper-v5"
     mine, base = (columns(results.rows(study), arm, "alc", "Hopper-v5") for arm in ("PPO-DAP", "PPO"))
     assert line(axes, "PPO-DAP").get_ydata() == pytest.approx([mine.mean() / base.mean() - 1])
     every = [line for line in axes.lines if line.get_alpha() == 0.45]

@@ -152,7 +152,7 @@ def fig8(results: Results, study: Study) -> Drawn:
         counts += [dot for own in found.values() for dot, _ in own.values()]
         _trade_off(axes, found, common, look)
         what = metrics(study, rows[0]["steps"])[metric]
-        axes.set_title(f"({letter}) {what}: {len(common)} task{'s' * (len(common) != 1)}")
+        axes.set_title(f"({letter}) {what}: {common[0] if len(common) == 1 else f'{len(common)} tasks'}")
     note = (
         "large: mean cost and interquartile mean of the change over the tasks that all methods have; small: each "
         f"task, {seeds_in_words(counts)} pairs; line: Pareto envelope"
