@@ -116,6 +116,8 @@ def test_a_run_that_the_store_made_again_takes_the_old_ones_place(store, tmp_pat
     assert (kept.runs[done.name]["processor"], kept.runs[done.name]["seconds"]) == ("Another", 7.0)
     # What was measured on the old one is none of the new one's.
     assert (list(kept.reports), kept.proposals) == (["s"], {})
+    kept.save(tmp_path / "results")
+    assert load_results(tmp_path / "results") == kept
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,8 @@ class Results:
         ):
             if rows:
                 write_atomically(folder / name, _csv(rows).encode())
+            else:  # what has been forgotten must not come back
+                (folder / name).unlink(missing_ok=True)
 
 
 def load_results(folder: Path) -> Results:

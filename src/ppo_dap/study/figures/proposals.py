@@ -154,8 +154,8 @@ def fig11(results: Results, study: Study) -> Drawn:
     figure.colorbar(marks, ax=grid, label="Q, normalised in its state", extend="both", shrink=0.8, aspect=30)
     count = len({row["state"] for row in results.proposals[found[0]["run"]]})
     note = (
-        f"t-SNE of the actions at {count} states; area: how often D_syn holds it; grey: all candidates; ringed: "
-        "high Q, at or above the 90th percentile of the state's unguided candidates"
+        f"t-SNE of the actions at {count} states; area: how often Eq. 7's weights draw it; grey: all candidates; "
+        "ringed: high Q, at or above the 90th percentile of the state's unguided candidates"
     )
     there = {labels["arm"] for labels in found}
     missing = [arm for arm in dict.fromkeys(e.labels["arm"] for e in study.entries) if arm not in there]
