@@ -156,6 +156,18 @@ def test_runs_in_no_pair_are_named():
     ]
 
 
+def test_the_clocks_of_two_processors_are_not_compared():
+    rows = [row(label, seed, 1.0) | {"seconds_per_step": 2.0} for label in ("ppo", "dap") for seed in (0, 1)]
+    rows = [own | {"processor": "A" if own["label"] == "ppo" or own["seed"] else "B"} for own in rows]
+    pairs = paired(rows, "dap", "ppo", "seconds_per_step")
+    assert pairs.values["Hopper-v5"].tolist() == [[2, 2]]
+    assert sorted(pairs.unpaired["Hopper-v5"]) == [
+        "dap without ppo on its processor, 200,000 steps: seed 0",
+        "ppo without dap on its processor, 200,000 steps: seed 0",
+    ]
+    assert len(paired(rows, "dap", "ppo", "alc").values["Hopper-v5"]) == 2
+
+
 def test_two_runs_for_one_place_are_refused():
     rows = [row("ppo", 0, 1.0), row("dap", 0, 1.0), row("ppo", 0, 2.0) | {"run": "runs/again"}]
     with pytest.raises(InputError, match=r"run runs/again .* of runs/Hopper-v5-ppo-0-200000 .*seed 0"):

@@ -87,10 +87,10 @@ def tasks(study: Study) -> dict[str, Row]:
 
 
 def rows_with_cost(results: Results, study: Study, **wanted: Any) -> list[Row]:
-    """`Results.rows`, with `wall`: seconds of training a step, start-up and compilation left out; None if unknown."""
+    """`Results.rows`, with `seconds_per_step`: of training, start-up and compilation left out; None if unknown."""
     rows = results.rows(study, **wanted)
     for row in rows:
-        row["wall"] = row["seconds_iteration"] / row["env_steps"] if row["env_steps"] else None
+        row["seconds_per_step"] = row["seconds_iteration"] / row["env_steps"] if row["env_steps"] else None
     return rows
 
 
@@ -110,7 +110,7 @@ def changes(rows: Sequence[Row], arm: str, baseline: str, metric: str) -> dict[s
 def cost_ratios(rows: Sequence[Row], arm: str, baseline: str) -> dict[str, Dot]:
     """Task -> seconds of training over those of the baseline on the same seeds; the median of the pairs'."""
     found = {}
-    for task, pairs in paired(rows, arm, baseline, "wall").values.items():
+    for task, pairs in paired(rows, arm, baseline, "seconds_per_step").values.items():
         x, y = pairs.T
         found[task] = Dot(median_ratio(x, y).value, math.nan, math.nan, {"": (x / y).tolist()}, len(x))
     return found

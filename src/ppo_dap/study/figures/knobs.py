@@ -46,7 +46,7 @@ KNOBS = {"K": "proposals a state, K", "share": "share of states with proposals"}
 def fig9(results: Results, study: Study) -> Drawn:
     """Gains over PPO and cost against K and against the share of states that get proposals; a line a setting."""
     rows = rows_with_cost(results, study)
-    measures = {**metrics(study, rows[0]["steps"] if rows else 0), "wall": "wall-clock / PPO's"}
+    measures = {**metrics(study, rows[0]["steps"] if rows else 0), "seconds_per_step": "wall-clock / PPO's"}
     found = {knob: {metric: _by_value(rows, study, knob, metric) for metric in measures} for knob in KNOBS}
     dots = [d for by in found.values() for series in by.values() for own in series.values() for d in own.values()]
     if not dots:
@@ -61,7 +61,7 @@ def fig9(results: Results, study: Study) -> Drawn:
     for column, (knob, label) in enumerate(KNOBS.items()):
         values = sorted({own[knob] for own in arms(study).values() if knob in own})
         for line, (metric, what) in zip(grid, measures.items(), strict=True):
-            cost = metric == "wall"
+            cost = metric == "seconds_per_step"
             panels.trends(line[column], [f"{v:g}" for v in values], found[knob][metric], look, baseline=float(cost))
             if column == 0:
                 line[column].set_ylabel(what if cost else f"{what}\nchange over |PPO|")
@@ -82,7 +82,11 @@ def _by_value(rows: Sequence[Row], study: Study, knob: str, metric: str) -> dict
         for arm, labels in arms(study).items():
             if knob not in labels:
                 continue
-            of_tasks = cost_ratios(rows, arm, PPO.name) if metric == "wall" else changes(rows, arm, PPO.name, metric)
+            of_tasks = (
+                cost_ratios(rows, arm, PPO.name)
+                if metric == "seconds_per_step"
+                else changes(rows, arm, PPO.name, metric)
+            )
             if task in of_tasks:
                 series = found.setdefault(f"{setting(where, ' ')}, {labels['preset']}", {})
                 series[f"{labels[knob]:g}"] = of_tasks[task]

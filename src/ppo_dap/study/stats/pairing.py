@@ -15,6 +15,8 @@ from ppo_dap.study.stats.measures import Values, matched
 
 Row = Mapping[str, Any]
 """A row of `summary.summarise`."""
+CLOCKED = ("seconds_per_step", "steps_per_second")
+"""What depends on the processor as much as on the method."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class Pairs:
 
 
 def paired(rows: Sequence[Row], method_a: str, method_b: str, key: str) -> Pairs:
-    """`key` of the runs of two methods (their labels) that agree in task, seed and steps.
+    """`key` of the runs of two methods (their labels) that agree in task, seed and steps, and for what is `CLOCKED` in
+    processor.
 
     A run without a partner, or whose figure is None, is left out and named in `unpaired`. Raises `InputError` for two
     runs of one method with the same task, seed and steps: which of them counts is not ours to say.
@@ -38,12 +41,14 @@ def paired(rows: Sequence[Row], method_a: str, method_b: str, key: str) -> Pairs
     unpaired: dict[tuple[str, str], list[str]] = {}
     for task, steps, seed in sorted(a.keys() | b.keys()):
         one, other = (side.get((task, steps, seed)) for side in (a, b))
-        if one is not None and other is not None and one[key] is not None and other[key] is not None:
+        apart = key in CLOCKED and one and other and one.get("processor") != other.get("processor")
+        if one is not None and other is not None and None not in (one[key], other[key]) and not apart:
             values.setdefault(task, []).append((one[key], other[key]))
             continue
         for method, row, partner in ((method_a, one, method_b), (method_b, other, method_a)):
             if row is not None:
-                lack = f"{method} without {key if row[key] is None else partner}, {steps:,} steps"
+                lack = key if row[key] is None else f"{partner} on its processor" if apart else partner
+                lack = f"{method} without {lack}, {steps:,} steps"
                 unpaired.setdefault((task, lack), []).append(str(seed))
     words: dict[str, list[str]] = {}
     for (task, lack), seeds in unpaired.items():

@@ -26,8 +26,8 @@ TESTED = (
 OTHER_LOGS = "The paper's tasks are -v2 and -v3 and its logs are not ours: compare changes, not returns."
 WALL = (
     "Wall-clock: seconds of all iterations after the two that compile, over their environment steps, without those of "
-    "over three times the median; x: median of the pairs' ratios. Runs of a study share a machine, so what else was "
-    "going on is in it; docs/performance.md has the figures of a quiet one."
+    "over three times the median; x: median of the ratios of pairs on the same processor. Runs of a study share a "
+    "machine, so what else was going on is in it; docs/performance.md has the figures of a quiet one."
 )
 
 
