@@ -25,7 +25,7 @@ from ppo_dap.study.store.store import open_store
 from ppo_dap.study.store.studies import STUDIES
 from study.store.store_made import COMMAND, base, contents, made, small_grid, study, supervisor
 
-GRID = small_grid(runs=2, slow=0.15)
+GRID = small_grid(runs=2, slow=0.25)
 PYTHON = sys.executable
 
 
@@ -215,7 +215,7 @@ def _kill_node(raylet, root, over, killed):
                     (claim.parent / "out" / "table").read_text().count("\n"),
                     json.loads(claim.read_text())["pid"],
                 )
-                if lines == 1 and _parent(_parent(pid)) == raylet:
+                if 1 <= lines <= 3 and _parent(_parent(pid)) == raylet:
                     doomed = [raylet, *_children(raylet)]
                     for process in doomed:
                         os.kill(process, signal.SIGKILL)
