@@ -91,6 +91,25 @@ def test_interrupt_ends_with_a_checkpoint_and_says_how_to_go_on(tmp_path, hopper
     assert f'\\"iteration\\": {run.metrics[-1]["iteration"]}'.encode() in header
 
 
+def test_after_an_interrupt_the_bits_are_those_of_an_uninterrupted_run(
+    tmp_path, monkeypatch, capsys, small, uninterrupted, hopper_prior
+):
+    """It comes between two checkpoints, where environments of no other run restart."""
+    out, iterate = tmp_path / "run", trainer.Trainer.iterate
+
+    def interrupted(self, collector):
+        iterate(self, collector)
+        if self.state.iteration == 4:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(trainer.Trainer, "iterate", interrupted)
+    options = {"prior": hopper_prior, "out": out, "steps": 1500, "progress": False} | small
+    assert not ppo_dap.train("Hopper-v5", **options).finished
+    assert f"{out}: stopping at the next checkpoint, after 2 more iterations; Ctrl-C again" in capsys.readouterr().err
+    ppo_dap.train("Hopper-v5", resume=True, **options)
+    assert_same(out, uninterrupted)
+
+
 def test_every_iteration_says_where_its_time_went(uninterrupted):
     metrics = ppo_dap.load_run(uninterrupted).metrics
     names = {f"seconds_{name}" for name in (*HOST, *DEVICE)}

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -74,6 +75,7 @@ class Trainer:
     """Called before the first iteration: waits until the stages are compiled."""
     clock: Clock = field(default_factory=Clock, init=False)
     interrupted: bool = field(default=False, init=False)
+    _told: bool = field(default=False, init=False)
     history: History | None = field(init=False)
     _pending: Pending | None = field(default=None, init=False)
     _next_draws: tuple[int, Draws] | None = field(default=None, init=False)
@@ -86,7 +88,7 @@ class Trainer:
         self._recorded_steps = self.state.env_steps
 
     def run(self) -> None:
-        """Train until the budget is spent, or until Ctrl-C; the last checkpoint holds the end either way."""
+        """Train until the budget is spent, or until a checkpoint after Ctrl-C, which holds the end either way."""
         self._write_audit()
         try:
             with self._deferred_interrupt(), pinned(self.config.run.pin_core and self.config.run.threads == 1):
@@ -114,16 +116,27 @@ class Trainer:
         env = make_vector_env(self.spec.task, self.config.ppo.num_envs, seed, config.threads)
         try:
             collector = Collector(env)
-            while not self.interrupted:
+            while True:
                 before = state.env_steps
                 self.iterate(collector)
                 due = config.eval_every and state.env_steps // config.eval_every > before // config.eval_every
                 if due or state.env_steps >= config.steps:
                     self.evaluate()
-                if state.env_steps >= config.steps or state.iteration % config.checkpoint_every == 0:
+                left = -state.iteration % config.checkpoint_every
+                if state.env_steps >= config.steps or not left:
                     break
+                self._tell_of_interrupt(left)
         finally:
             env.close()
+
+    def _tell_of_interrupt(self, left: int) -> None:
+        """Say, once, how long it takes: a checkpoint before its time would have the resumed run restart environments
+        where no other run does.
+        """
+        if self.interrupted and not self._told:
+            text = f"stopping at the next checkpoint, after {left} more iterations; Ctrl-C again stops at once"
+            print(f"{self.folder}: {text}", file=sys.stderr, flush=True)
+            self._told = True
 
     def iterate(self, collector: Collector) -> None:
         """One iteration of Algorithm 1. Returns when the actor is there; the last iteration's metrics are recorded."""
@@ -306,7 +319,7 @@ class Trainer:
 
     @contextmanager
     def _deferred_interrupt(self) -> Iterator[None]:
-        """Ctrl-C ends the run after the iteration that is under way; a second one ends it at once."""
+        """Ctrl-C ends the run at its next checkpoint; a second one ends it at once."""
 
         def note(signum, frame):
             self.interrupted = True
