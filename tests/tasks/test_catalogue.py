@@ -172,6 +172,8 @@ def test_what_is_no_task_for_us_is_refused_in_one_line(task, message):
         (SMALL, gymnasium.spaces.MultiBinary(2), "action space"),
         (SMALL, Box(-1, 1, (2, 2)), "action space"),
         (Box(0, 1, (2, 2)), SMALL, "observation space"),
+        (Box(0, 1, (0,)), SMALL, "observation space"),
+        (SMALL, Box(0, 1, (0,)), "action space"),
         (gymnasium.spaces.Dict({"a": SMALL}), SMALL, "observation space"),
     ],
 )

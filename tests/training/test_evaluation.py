@@ -1,5 +1,9 @@
-import numpy as np
+import contextlib
 
+import numpy as np
+import pytest
+
+from ppo_dap.errors import InputError
 from ppo_dap.nets.policy import Policy
 from ppo_dap.tasks import Transition
 from ppo_dap.training import evaluation
@@ -39,6 +43,18 @@ def test_the_first_episode_of_each_environment_counts_and_no_other(monkeypatch):
     row = result.row(7)
     assert (row["return_mean"], row["length_mean"], row["episodes"], row["env_steps"]) == (3.0, 3.0, 3, 7)
     np.testing.assert_allclose(row["return_std"], np.std([2, 3, 4]))
+
+
+@pytest.mark.parametrize("most", [4, 3])
+def test_an_episode_without_an_end_is_told_and_not_waited_for(monkeypatch, most):
+    """The longest of these has 4 steps."""
+    env = Countdown()
+    monkeypatch.setattr(evaluation, "make_vector_env", lambda *a: env)
+    monkeypatch.setattr(evaluation, "ENDLESS", most)
+    endless = pytest.raises(InputError, match="made-v0: an episode has no end after 3 steps: step must truncate it")
+    with contextlib.nullcontext() if most == 4 else endless:
+        assert evaluation.evaluate_policy(constant_policy(), "made-v0", 3, seed=0).lengths == (2, 3, 4)
+    assert env.closed
 
 
 def test_evaluation_depends_on_its_seed_alone():

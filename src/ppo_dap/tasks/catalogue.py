@@ -99,6 +99,8 @@ def describe(task: str) -> TaskSpec:
 
     A task of the catalogue is looked up; of every other a copy is made, to ask it for its spaces.
     """
+    if not isinstance(task, str) or task.startswith(":") or task.count(":") > 1:
+        raise InputError(f"task must be a Gymnasium id or package.module:ClassName, not {task!r}")
     task = NAMESPACED.get(task, task)
     if task in CATALOGUE:
         return CATALOGUE[task]
@@ -133,7 +135,7 @@ def make_gymnasium(task: str, **options: Any) -> Any:
         known = set(gymnasium.registry) | ENVPOOL_TASKS | set(CATALOGUE)
         near = difflib.get_close_matches(task, known, n=1)
         raise unknown("task", task, known if near else CATALOGUE) from None
-    except (gymnasium.error.Error, ImportError) as error:
+    except Exception as error:  # whatever an environment, or the module that registers it, raises while it is made
         raise InputError(f"task {task!r} cannot be made: {' '.join(str(error).split())}") from error
 
 
@@ -151,7 +153,7 @@ def _spec(task: str, env: Any, backend: Any) -> TaskSpec:
 
     for what in ("observation", "action"):
         space = getattr(env, f"{what}_space", None)
-        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1 or space.shape[0] < 1:
             raise InputError(
                 f"task {task!r} has the {what} space {space}: ppo-dap needs a one-dimensional box of real numbers, "
                 "as Pendulum-v1 has"

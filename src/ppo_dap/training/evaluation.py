@@ -6,8 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ppo_dap.errors import InputError
 from ppo_dap.nets.policy import Policy
 from ppo_dap.tasks import make_vector_env
+
+ENDLESS = 1_000_000
+"""An episode of so many steps has no end: a task without a time limit would keep an evaluation for ever."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +40,12 @@ def evaluate_policy(policy: Policy, task: str, episodes: int, seed: int, threads
         observations = env.reset()
         returns, lengths, running = np.zeros(episodes), np.zeros(episodes, int), np.ones(episodes, bool)
         while running.any():
-            step = env.step(policy(observations))
+            step = env.step(policy.unscale(policy.mean(observations)))  # one that ended may show NaN
             returns += np.where(running, step.rewards, 0.0)
             lengths += running
             running &= ~(step.terminated | step.truncated)
+            if lengths.max() >= ENDLESS and running.any():
+                raise InputError(f"task {task}: an episode has no end after {ENDLESS:,} steps: step must truncate it")
             observations = step.observations
         return Evaluation(tuple(returns.tolist()), tuple(lengths.tolist()))
     finally:
