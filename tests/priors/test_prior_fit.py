@@ -112,6 +112,13 @@ def test_progress_is_told_of_every_chunk(logs):
     assert 0 <= seen[0].seconds <= seen[1].seconds
 
 
+def test_no_step_is_taken_beyond_max_steps(logs):
+    seen = []
+    prior = fit_prior(logs, progress=seen.append, **{**QUICK, "max_steps": 13})
+    assert [p.step for p in seen] == [10, 13]
+    assert prior.training["steps"] == 13
+
+
 def scripted(monkeypatch, losses):
     """Let the held-out loss follow a script; the averaged weights carry the number of their look."""
     calls = []
@@ -142,7 +149,7 @@ def test_early_stopping_keeps_the_best(monkeypatch):
 
 
 def test_a_fit_that_diverges_says_when(monkeypatch):
-    with pytest.raises(TrainingDiverged, match="not finite at step 20"):
+    with pytest.raises(TrainingDiverged, match="not finite at step 20: lower learning_rate"):
         scripted(monkeypatch, [1.0, float("nan")])
 
 

@@ -152,17 +152,19 @@ def train_network(
     picked = rng.permutation(held_out.actions.shape[0])[:VALIDATION_ROWS]
     held_out = Rows(*(on_device(np.asarray(a)[picked]) for a in held_out))
     held_out_draws = state.network.draw_loss(rng, len(picked))
-    size = (config.chunk_steps, config.batch_size)
     best, best_loss, best_step, step, train_loss = state.ema, float("inf"), 0, 0, float("nan")
     start = time.perf_counter()
     while step < config.max_steps:
+        size = (min(config.chunk_steps, config.max_steps - step), config.batch_size)
         picks = rng.integers(0, train.actions.shape[0], size, dtype=np.int32)
         draws = Draws(state.network.draw_loss(rng, *size), _shown(rng, size, config))  # type: ignore[arg-type]
         state, losses = train_chunk(state, train, held_out, picks, draws, held_out_draws, config)
         step = int(state.step)
         train_loss, validation_loss = (float(loss) for loss in losses)
         if not (np.isfinite(train_loss) and np.isfinite(validation_loss)):
-            raise TrainingDiverged(f"fit of the prior: the loss is not finite at step {step}")
+            raise TrainingDiverged(
+                f"fit of the prior: the loss is not finite at step {step}: lower learning_rate {config.learning_rate:g}"
+            )
         if validation_loss < best_loss:
             best, best_loss, best_step = state.ema, validation_loss, step
         if progress is not None:
