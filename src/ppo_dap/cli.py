@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
+import ppo_dap
 from ppo_dap.commands import runs, stages, studies
 from ppo_dap.commands.options import (
     config_options,
     filter_option,
+    finite_number,
     logs_option,
     number_of_0_or_more,
     positive_count,
@@ -29,6 +32,13 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise instead of printing the usage."""
         raise InputError(message.removeprefix("argument "))
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Argparse's, for a command or a choice, with the nearest known one."""
+        if action.choices is not None and value not in action.choices:
+            raise unknown(
+                action.option_strings[0] if action.option_strings else str(action.metavar), value, action.choices
+            )
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
         """The options; raises `InputError` for anything that is none."""
@@ -51,6 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser, warnings.showwarning = build_parser(), _show_warning
     try:
         options = parser.parse(sys.argv[1:] if arguments is None else arguments)
+        if options.version:
+            print(f"ppo-dap {ppo_dap.__version__}")
+            return 0
         if options.command is None:
             parser.print_help()
             return 0
@@ -67,13 +80,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _show_warning(message: Any, category: type, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
-    """A warning in one line, without the place in the code that it came from."""
-    print(f"ppo-dap: warning: {message}", file=sys.stderr)
+    """A warning in one line, without the place in the code that it came from, and without Gymnasium's colours."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(message)).removeprefix("WARN: ")
+    print(f"ppo-dap: warning: {text}", file=sys.stderr)
 
 
 def build_parser() -> Parser:
     """All commands with their options."""
     parser = Parser(prog="ppo-dap", description="Logged trajectories in, faster PPO out, strictly on-policy.")
+    parser.add_argument("--version", action="store_true", help="print the version and do nothing else")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
     parser.subcommands = subparsers
 
@@ -108,7 +123,7 @@ def _from_logs_to_runs(command: Command) -> None:
     sub.add_argument("--task", metavar="ID", help="task of the logs, where they do not say (gives the action bounds)")
     for bound in ("low", "high"):
         text = f"{bound}est action, a number or one for each action (default: the task's, or as the logs say)"
-        sub.add_argument(f"--action-{bound}", nargs="+", type=float, metavar="X", help=text)
+        sub.add_argument(f"--action-{bound}", nargs="+", type=finite_number, metavar="X", help=text)
     sub.add_argument("--out", required=True, metavar="FILE", help="file of the prior")
     sub.add_argument("--kind", default="diffusion", help=f"{', '.join(FITTED)} (default: %(default)s)")
     filter_option(sub)
@@ -243,15 +258,12 @@ def _collect_options(command: Command) -> None:
     sub.add_argument(
         "--steps", type=positive_count, default=100_000, help="rows at least, in whole episodes (default: %(default)s)"
     )
-    sub.add_argument(
-        "--train-steps", type=positive_count, default=1_000_000, help="of a behaviour run (default: %(default)s)"
-    )
+    sub.add_argument("--train-steps", type=positive_count, help="of a behaviour run, for tiers (default: 1000000)")
     sub.add_argument("--seed", type=seed, default=0, help="seed of training, environments and noise (default: 0)")
     sub.add_argument(
         "--noise",
         type=number_of_0_or_more,
-        default=1.0,
-        help="times the policy's own noise, for a RUN (default: %(default)s)",
+        help="times the policy's own noise, for a RUN (default: 1.0)",
     )
     sub.add_argument("--json", action="store_true", help="print JSON")
 

@@ -35,4 +35,4 @@ def unknown(what: str, value: object, known: Iterable[str]) -> InputError:
     if near and len(names) > MANY:
         return InputError(f"unknown {what} {value!r}: did you mean {near[0]!r}?")
     hint = f"did you mean {near[0]!r}? " if near else ""
-    return InputError(f"unknown {what} {value!r}: {hint}known are {', '.join(names)}")
+    return InputError(f"unknown {what} {value!r}: {hint}known are {', '.join(names) or 'none'}")

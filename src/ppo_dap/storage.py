@@ -6,6 +6,7 @@ import json
 import math
 import os
 import secrets
+import tempfile
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,6 +43,34 @@ def write_atomically(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
+def require_place(what: str, path: str | os.PathLike) -> Path:
+    """`path` as a Path; raises `InputError`, before the work is done, unless `write_atomically` can write there."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{what} {path} is a folder: name a file")
+    _require_writable(what, path, path.parent)
+    return path
+
+
+def require_folder(what: str, path: str | os.PathLike) -> Path:
+    """`path` as a Path; raises `InputError` unless it is a folder that files can be put into, or can be made one."""
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{what} {path} is a file: name a folder")
+    _require_writable(what, path, path)
+    return path
+
+
+def _require_writable(what: str, path: Path, folder: Path) -> None:
+    folder = next(place for place in (folder, *folder.parents) if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        why = f"{folder}: {error.strerror}"
+        raise InputError(f"{what} {path} cannot be written ({why}): must be in a writable folder") from None
+
+
 def without_nan(value: Any) -> Any:
     """`value` with None for every number that is none: JSON has no NaN."""
     if isinstance(value, Mapping):
@@ -73,6 +102,17 @@ def tree_from_tensors(like: Any, tensors: Mapping[str, np.ndarray], prefix: str,
             raise InputError(f"{source} has {found} for {name} where {leaf.shape} is needed: was it another config?")
         loaded.append(jax.device_put(tensors[name]))
     return jax.tree.unflatten(jax.tree.structure(like), loaded)
+
+
+def kind_of(path: Path) -> str | None:
+    """The kind of a file that `write_tensors` wrote, or None for any other."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:
+            return json.loads((file.metadata() or {}).get("meta", "{}")).get("kind")
+    except (SafetensorError, ValueError, OSError, AttributeError):
+        return None
 
 
 def read_tensors(path: Path, kind: str, newest: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -79,6 +79,13 @@ BAD = {
     "method": (f"train --task {TASK} --method ppo-dab --out out", "unknown method 'ppo-dab'", "did you mean 'ppo-dap'"),
     "task": ("train --task Hoper-v5 --method ppo --out out", "unknown task 'Hoper-v5'", "did you mean 'Hopper-v5'"),
     "far task": ("train --task qqqq --method ppo --out out", "unknown task 'qqqq'", "Hopper-v5"),
+    "task without a module": (f"train --task :{TASK} --method ppo --out out", "must be a Gymnasium id", ":Pendulum-v1"),
+    "task of two colons": ("train --task a:b:c --method ppo --out out", "must be a Gymnasium id", "'a:b:c'"),
+    "module without environments": (
+        "train --task json:No --method ppo --out out",
+        "class of json 'No'",
+        "known are none",
+    ),
     "bad task id": ("train --task Hop/per/x --method ppo --out out", "task 'Hop/per/x'"),
     "check-logs task": ("check-logs --logs @good.npz --task Pendulun-v1", "unknown task", "'Pendulum-v1'"),
     "pretrain task": ("pretrain --logs @good.npz --task Pendulun-v1 --out out", "unknown task", "'Pendulum-v1'"),
@@ -87,7 +94,8 @@ BAD = {
     "option of another command": ("methods --steps 3", "unknown option '--steps'", "--json"),
     "abbreviated option": (f"{PPO} --lambda 1", "unknown option '--lambda'"),
     "argument": (f"{PPO} more", "unexpected argument 'more'"),
-    "command": ("trian", "COMMAND", "'trian'", "train", "summary"),
+    "command": ("trian", "unknown COMMAND 'trian'", "did you mean 'train'", "summary"),
+    "choice": ("reliability @run --prior @prior --checkpoint lst", "--checkpoint 'lst'", "did you mean 'last'", "best"),
     "no task": ("train --method ppo --out out", "required", "--task"),
     "no out": (f"train --task {TASK} --method ppo", "required", "--out"),
     "no logs": ("check-logs", "required", "--logs"),
@@ -117,6 +125,17 @@ BAD = {
     "pretrain seed": ("pretrain --logs @good.npz --task Pendulum-v1 --out out --seed -1", "seed", "-1"),
     "pretrain seed word": ("pretrain --logs @good.npz --out out --seed x", "--seed", "'x'"),
     "pretrain without bounds": ("pretrain --logs @good.npz --out out", "action_low"),
+    "pretrain bound": (
+        "pretrain --logs @good.npz --out out --action-low x",
+        "--action-low",
+        "a finite number, not 'x'",
+    ),
+    "columns twice": (
+        "check-logs --logs @logs.csv --columns actions=a actions=b",
+        "--columns has actions twice",
+        "actions=A,B",
+    ),
+    "only twice": ("study table4 --only task=a --only task=b", "--only has task twice", "task=A,B"),
     "pretrain observations": (f"pretrain --logs @wide.npz --task {TASK} --out out", "observations has 4", "has 3"),
     "pretrain actions": (f"pretrain --logs @two.npz --task {TASK} --out out", "2", "1"),
     # Outputs.
@@ -127,6 +146,34 @@ BAD = {
     "out is a file": (f"train --task {TASK} --method ppo --out @file", "is a file", "name a folder"),
     "out holds a run": (f"train --task {TASK} --method ppo --out @run", "holds a run already", "new folder, or resume"),
     "out has files": (f"train --task {TASK} --method ppo --out @other", "other files in it", "name a new one"),
+    **{
+        f"{what}: {place}": (command.format(f"@{place}"), what.split()[-1], place, *words)
+        for what, command in {
+            "train out": f"train --task {TASK} --method ppo --out {{}}",
+            "collect out": f"collect --task {TASK} --tier random --out {{}}",
+            "quickstart out": "quickstart --out {}",
+            "study results": "study table4 --draw --results {}",
+        }.items()
+        for place, words in (("file/x", ("cannot be written", "Not a directory", "writable folder")),)
+    },
+    **{
+        f"{what}: {place}": (command.format(f"@{place}"), what.split()[-1], place, *words)
+        for what, command in {
+            "pretrain prior": f"pretrain --logs @good.npz --task {TASK} --out {{}}",
+            "summary csv": "summary @run --csv {}",
+            "bench json": "bench --json {}",
+        }.items()
+        for place, words in (
+            ("file/x", ("cannot be written", "Not a directory", "writable folder")),
+            ("other", ("is a folder: name a file",)),
+        )
+    },
+    "pretrain without a name": (f"pretrain --logs @good.npz --task {TASK} --out .", "prior .", "name a file"),
+    "pretrain over its logs": (f"pretrain --logs @good.npz --task {TASK} --out @good.npz", "good.npz", "is no prior"),
+    "collect in a file": ("collect @run --out @file/out.npz --steps 1", "file/out.npz", "cannot be written"),
+    "collect noise of tiers": (f"collect --task {TASK} --out out --noise 2", "--noise 2", "leave it out"),
+    "collect steps of training": ("collect @run --out out.npz --train-steps 9", "--train-steps 9", "leave it out"),
+    "bench sweep": ("bench --sweep costs.png", "costs.png", "must end in .csv"),
     # Runs.
     **{
         f"{command} of {what}": (f"{command} @{what}" + tail, what, words)
@@ -134,12 +181,16 @@ BAD = {
         for what, words in (("other", "not a run folder"), ("nothing", "no config.json"), ("damaged", "damaged"))
     },
     "audit of no audit": ("audit @run", "has no audit.json"),
-    "evaluate without policy": ("evaluate @run-policyless", "no policy file at"),
+    "evaluate without policy": ("evaluate @run-policyless", "no policy file at", "--resume"),
     "evaluate newer": ("evaluate @run-newer", "policy format 99", "reads up to", "update ppo-dap"),
     "evaluate episodes": ("evaluate @run --episodes 0", "--episodes: must be a whole number above 0, not '0'"),
     "evaluate seed": ("evaluate @run --seed -1", "seed", "-1"),
     "evaluate task": ("evaluate @run --task CartPole-v1", "CartPole-v1", "Discrete(2)"),
-    "evaluate dimensions": ("evaluate @run --task MountainCarContinuous-v0", "2", "3"),
+    "evaluate dimensions": (
+        "evaluate @run --task MountainCarContinuous-v0",
+        "MountainCarContinuous-v0 has 2 observations and 1 actions",
+        "3 observations and 1 actions",
+    ),
     "collect steps": ("collect @run --out out.npz --steps 0", "steps", "above 0", "0"),
     "collect seed": ("collect @run --out out.npz --steps 1 --seed -1", "seed", "-1"),
     "collect noise": ("collect @run --out out.npz --steps 1 --noise nan", "noise", "nan"),
@@ -164,12 +215,3 @@ def test_a_choice_that_does_not_exist(here, options, words):
     done = shell(here, *options.split())
     one_line(done.stderr, words)
     assert (done.returncode, done.stdout, list(here.iterdir())) == (2, "", [])
-
-
-def test_pretrain_into_a_folder(capsys, files, here, monkeypatch):
-    import ppo_dap.priors
-
-    prior = ppo_dap.priors.load_prior(files / "prior")
-    monkeypatch.setattr(ppo_dap.priors, "fit_prior", lambda logs, kind, **options: prior)
-    command = f"pretrain --logs @good.npz --task {TASK} --out @other"
-    is_refused(capsys, files, here, command, "cannot write prior", "other")

@@ -2,12 +2,15 @@
 
 import dataclasses
 import json
+import tomllib
 import typing
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import ppo_dap
 from cli.cli_made import TASK, arrays, shell
 from ppo_dap.cli import main
 from ppo_dap.commands.options import field_docstrings
@@ -87,6 +90,19 @@ def test_no_command_is_help(capsys):
     assert main([]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in COMMANDS)
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"ppo-dap {ppo_dap.__version__}\n"
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    assert ppo_dap.__version__ == project["project"]["version"]
+
+
+def test_a_warning_of_gymnasium_has_no_colours(files, here):
+    done = shell(here, "check-logs", "--logs", str(files / "good.npz"), "--task", "Pendulum")
+    assert done.stderr.startswith("ppo-dap: warning: Using the latest versioned environment `Pendulum-v1`")
+    assert "\x1b" not in done.stderr
 
 
 @pytest.mark.parametrize("command", [(), *((name,) for name in COMMANDS)])

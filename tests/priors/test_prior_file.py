@@ -116,7 +116,21 @@ def test_unreadable_header(prior, tmp_path):
 
 
 def test_wrong_sizes_are_refused(prior):
-    with pytest.raises(InputError, match="observations have 3 numbers, the prior's 2"):
+    with pytest.raises(InputError, match=r"observations have shape \(4, 3\): this prior takes \(n, 2\)"):
         prior.sample(np.zeros((4, 3)), jax.random.key(0), 2)
     with pytest.raises(InputError, match="fitted with condition_on 'return'; this one was not"):
         prior.sample(np.zeros((4, 2)), jax.random.key(0), 2, asked="top")
+    with pytest.raises(InputError, match="observations have NaN or infinite entries"):
+        prior.sample(np.full((4, 2), np.nan), jax.random.key(0), 2)
+    with pytest.raises(InputError, match="num must be a whole number of 0 or more, not -1"):
+        prior.sample(np.zeros((4, 2)), jax.random.key(0), -1)
+
+
+def test_a_prior_is_written_over_a_prior_alone(prior, tmp_path):
+    path = saved(prior, tmp_path)
+    prior.save(path)
+    for content in (b"logs", b"", b"PK\x03\x04 and more"):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="prior is there already and is no prior: name a new file"):
+            prior.save(path)
+        assert path.read_bytes() == content

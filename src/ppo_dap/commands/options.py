@@ -10,10 +10,11 @@ import inspect
 import itertools
 import math
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from ppo_dap import config as configs
+from ppo_dap.errors import InputError
 from ppo_dap.fields import type_hints
 from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 
@@ -43,6 +44,19 @@ positive_number = number(float, lambda v: 0 < v < math.inf, "a number above 0")
 
 
 number_of_0_or_more = number(float, lambda v: 0 <= v < math.inf, "a number of 0 or more")
+
+
+finite_number = number(float, math.isfinite, "a finite number")
+
+
+def each_once(option: str, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """What an option of the form NAME=... says of each name; raises `InputError` for a name that is there twice."""
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise InputError(f"{option} has {name} twice: give it once, with all that belongs to it: {name}=A,B")
+        found[name] = value
+    return found
 
 
 def column(text: str) -> tuple[str, list[str] | None]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ppo_dap.errors import InputError
-from ppo_dap.storage import without_nan
+from ppo_dap.storage import require_place, without_nan, write_atomically
 from ppo_dap.training.manifest import prepare_jax
 
 
@@ -28,6 +28,7 @@ def evaluate(options: argparse.Namespace) -> int:
     if options.video is not None:
         require_video(options.video)
     task = options.task or run.config["task"]
+    _require_same_sizes(run, task)
     row = evaluate_policy(run.policy, task, options.episodes, options.seed).row(run.evaluations[-1]["env_steps"])
     if options.json:
         print(json.dumps(row))
@@ -42,12 +43,27 @@ def evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
+def _require_same_sizes(run: Any, task: str) -> None:
+    from ppo_dap.tasks import describe
+
+    spec, policy = describe(task), run.policy
+    found, right = (spec.observation_size, spec.action_size), (len(policy.observation_mean), len(policy.action_low))
+    if found != right:
+        what = "{} observations and {} actions"
+        raise InputError(f"task {task} has {what.format(*found)}, the policy of {run.folder} {what.format(*right)}")
+
+
 def bench(options: argparse.Namespace) -> int:
     """The benchmark."""
     from ppo_dap.study.bench.bench import bench, print_bench
     from ppo_dap.study.bench.sweep import sweep
     from ppo_dap.tasks import describe
 
+    if options.sweep is not None and Path(options.sweep).suffix != ".csv":
+        raise InputError(f"sweep {options.sweep} must end in .csv: its figure goes beside it, to a .png")
+    for name in ("json", "sweep"):
+        if getattr(options, name) is not None:
+            require_place(name, getattr(options, name))
     tasks = options.task or ["Walker2d-v5", "HalfCheetah-v5"]
     for task in tasks:
         describe(task)
@@ -60,7 +76,7 @@ def bench(options: argparse.Namespace) -> int:
     figures = bench(tasks, options.steps, options.repeats, peers, functools.partial(print, flush=True))
     print_bench(figures)
     if options.json is not None:
-        Path(options.json).write_text(json.dumps(figures, indent=1) + "\n")
+        write_atomically(Path(options.json), (json.dumps(figures, indent=1) + "\n").encode())
     return 0
 
 
@@ -122,6 +138,8 @@ def summary(options: argparse.Namespace) -> int:
 
     if options.markdown and options.compare is None:
         raise InputError("--markdown prints a comparison: give --compare METHOD as well")
+    if options.csv is not None:
+        require_place("csv", options.csv)
     rows = summarise([load_run(folder) for folder in options.folders], options.epochs)
     fair = all(row["declared"] for row in rows)
     if options.compare is None:

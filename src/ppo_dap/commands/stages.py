@@ -8,12 +8,13 @@ import itertools
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from ppo_dap import config as configs
+from ppo_dap.commands.options import each_once
 from ppo_dap.errors import InputError, unknown
 from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
+from ppo_dap.storage import require_folder
 from ppo_dap.training.manifest import prepare_jax
 
 
@@ -22,7 +23,7 @@ def quickstart(options: argparse.Namespace) -> int:
     prepare_jax()
     from ppo_dap.study.quickstart import quickstart
 
-    return 0 if quickstart(Path(options.out)) else 1
+    return 0 if quickstart(require_folder("out", options.out)) else 1
 
 
 def check_logs(options: argparse.Namespace) -> int:
@@ -56,7 +57,7 @@ def check_logs(options: argparse.Namespace) -> int:
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:
     """How the logs are to be read, beside their place."""
-    given = {"columns": options.columns and dict(options.columns), "max_bytes": options.max_bytes}
+    given = {"columns": options.columns and each_once("--columns", options.columns), "max_bytes": options.max_bytes}
     return {name: value for name, value in given.items() if value is not None}
 
 
@@ -67,7 +68,9 @@ def pretrain(options: argparse.Namespace) -> int:
     from ppo_dap.logs import best_episodes, load_logs
     from ppo_dap.logs.coverage import cover, coverage_statistics
     from ppo_dap.priors import fit_prior
+    from ppo_dap.priors.prior import require_prior_place
 
+    require_prior_place(options.out)
     logs = load_logs(options.logs, options.task, seed=options.seed, **_reading(options))
     if options.logs_filter < 1:
         logs = best_episodes(logs, options.logs_filter)
@@ -181,13 +184,16 @@ def collect(options: argparse.Namespace) -> int:
         return _collect_tiers(options)
     if options.task or options.tier or options.all:
         raise InputError(f"RUN {options.folder} is logged as it is: leave --task, --tier and --all out")
-    from ppo_dap.logs import save_npz
+    if options.train_steps is not None:
+        raise InputError(f"--train-steps {options.train_steps} is of a behaviour run, and RUN is there: leave it out")
+    from ppo_dap.logs.npz import require_npz, save_npz
     from ppo_dap.training.collect import collect_logs
     from ppo_dap.training.run import load_run
 
-    run = load_run(options.folder)
-    logs = collect_logs(run.policy, run.config["task"], options.steps, options.seed, noise=options.noise)
-    save_npz(logs, options.out)
+    run, out = load_run(options.folder), require_npz(options.out)
+    noise = 1.0 if options.noise is None else options.noise
+    logs = collect_logs(run.policy, run.config["task"], options.steps, options.seed, noise=noise)
+    save_npz(logs, out)
     summary = logs.episode_returns()
     assert summary is not None  # collected logs have rewards
     row = {"out": options.out, "rows": logs.num_rows, "episodes": logs.num_episodes}
@@ -209,10 +215,12 @@ def _collect_tiers(options: argparse.Namespace) -> int:
     wanted = ["medium", "medium-replay", "medium-expert"] if options.all else options.tier or ["medium"]
     if not tasks:
         raise InputError("nothing to log: name a RUN, a --task, or --all")
+    if options.noise is not None:
+        raise InputError(f"--noise {options.noise:g} is for a RUN: tiers have the policies' own, leave it out")
     tiers.check_tiers(wanted)
     tasks = [describe(task).task for task in tasks]
-    folder, rows = Path(options.out), []
-    request = {"rows": options.steps, "seed": options.seed, "steps": options.train_steps, "folder": folder}
+    folder, rows = require_folder("out", options.out), []
+    request = {"rows": options.steps, "seed": options.seed, "steps": options.train_steps or 1_000_000, "folder": folder}
     plan = {task: tiers.estimate(task, wanted, **request) for task in tasks}
     for task, seconds in plan.items():
         print(f"{task}: {', '.join(wanted)}: about {seconds / 60:.0f} min", file=sys.stderr)

@@ -9,8 +9,9 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ppo_dap.commands.options import positive_count, seed
+from ppo_dap.commands.options import each_once, positive_count, seed
 from ppo_dap.errors import InputError
+from ppo_dap.storage import require_folder
 
 if TYPE_CHECKING:
     from ppo_dap.study.store.grids import Study
@@ -89,7 +90,7 @@ def study(options: argparse.Namespace) -> int:
     if options.ray is not None and (options.dry_run or options.draw):
         raise InputError("--ray runs cells, --dry-run and --draw run none: leave it out, or name --workers")
     whole = make_study(options.name, seeds=options.seeds, steps=options.steps)
-    chosen = only(whole, dict(options.only))
+    chosen = only(whole, each_once("--only", options.only))
     plan = Plan(chosen, open_store(Path(options.store)), _speed)
     if options.dry_run:
         if options.json:
@@ -98,7 +99,7 @@ def study(options: argparse.Namespace) -> int:
         else:
             print_plan(plan, options.workers or _cores())
         return 0
-    folder, complete = Path(options.results or plan.store.root / "results"), True
+    folder, complete = require_folder("results", options.results or plan.store.root / "results"), True
     if options.document is not None:
         from ppo_dap.study.draw import fill
 

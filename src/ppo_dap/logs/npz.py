@@ -14,7 +14,7 @@ from ppo_dap.errors import InputError, unknown
 from ppo_dap.logs.dataset import LATER_FIELDS, Logs
 from ppo_dap.logs.reading import assemble, reading, refuse_large, require_file, row_pieces
 from ppo_dap.logs.sampling import Budget
-from ppo_dap.storage import write_atomically
+from ppo_dap.storage import require_place, write_atomically
 
 ALIASES = {"terminals": "terminated", "timeouts": "truncated"}
 KEYS = (
@@ -122,15 +122,20 @@ class Member:
         return content.reshape(self.shape, order="F" if self.fortran_order else "C")
 
 
+def require_npz(path: str | os.PathLike) -> Path:
+    """`path` as a Path; raises `InputError` unless it ends in .npz and logs can be written there."""
+    if Path(path).suffix != ".npz":
+        raise InputError(f"{path}: must end in .npz")
+    return require_place("logs", path)
+
+
 def save_npz(logs: Logs, path: str | os.PathLike) -> None:
     """Write `logs` as `.npz`: the same logs give the same bytes, and `load_logs(path)` gives the same `hash()`.
 
     Atomic: the file is either there in full or not touched. Raises `InputError` when `path` does not end in .npz or
     cannot be written.
     """
-    path = Path(path)
-    if path.suffix != ".npz":
-        raise InputError(f"{path}: must end in .npz")
+    path = require_npz(path)
     arrays = {"observations": logs.observations, "actions": logs.actions}
     # The episode's number marks ends without a claim about why an episode ended.
     arrays["episode_id"] = np.cumsum(logs.episode_ends, dtype=np.int32) - logs.episode_ends.astype(np.int32)

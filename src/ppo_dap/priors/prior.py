@@ -7,11 +7,12 @@ Outside a prior actions are in the environment's units; inside they are scaled s
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from ppo_dap.errors import InputError, unknown
 from ppo_dap.prior_config import PRIOR_CONFIGS
 from ppo_dap.priors.kinds import NETWORKS
 from ppo_dap.priors.samplers import Solver
-from ppo_dap.storage import read_tensors, tree_from_tensors, tree_to_tensors, write_tensors
+from ppo_dap.storage import kind_of, read_tensors, require_place, tree_from_tensors, tree_to_tensors, write_tensors
 
 FORMAT = 2
 """1 held diffusion priors alone."""
@@ -110,6 +111,8 @@ class Prior:
 
         Raises `InputError` if the prior was not conditioned on the return and is asked for one.
         """
+        if asked not in get_args(Asked):
+            raise unknown("return to ask for", asked, get_args(Asked))
         if asked == "none":
             return np.zeros(self.config.num_conditions, np.float32)
         if not self.asks:
@@ -125,30 +128,45 @@ class Prior:
         num: int,
         asked: Asked = "none",
     ) -> Float[Array, "n {num} act"]:
-        """`num` actions a state, in environment units."""
-        if observations.shape[1] != self.observation_size:
-            raise InputError(f"observations have {observations.shape[1]} numbers, the prior's {self.observation_size}")
+        """`num` actions a state, in environment units; raises `InputError` for other observations than the logs'."""
+        if np.ndim(observations) != 2 or np.shape(observations)[1] != self.observation_size:
+            raise InputError(
+                f"observations have shape {np.shape(observations)}: this prior takes (n, {self.observation_size})"
+            )
+        if not np.isfinite(np.asarray(observations)).all():
+            raise InputError("observations have NaN or infinite entries: this prior takes finite numbers")
+        if num < 0:
+            raise InputError(f"num must be a whole number of 0 or more, not {num!r}")
         solver = Solver(getattr(self.config, "sampler", "ancestral"), getattr(self.config, "sampler_steps", 1))
-        noise = jax.random.normal(key, self.network.noise_shape(solver, observations.shape[0], num))
+        noise = jax.random.normal(key, self.network.noise_shape(solver, len(observations), num))
         inputs = jnp.asarray(observations, jnp.float32), jnp.asarray(self.condition(asked))
         scaled = _sample(self.network, *inputs, noise, solver)
         return unscale_actions(scaled, self.action_low, self.action_high)
 
     def save(self, path: str | Path) -> None:
-        """Write the prior to exactly `path`."""
+        """Write the prior to exactly `path`; raises `InputError` where that would cost another file its content."""
+        path = require_prior_place(path)
         tensors = tree_to_tensors(self.network, "network")
         for name in _ARRAYS:
             tensors[name] = getattr(self, name)
         header = {"kind": "prior", "format": FORMAT, "prior": self.kind, "config": dataclasses.asdict(self.config)}
         header |= {name: getattr(self, name) for name in _HEADER}
         try:
-            write_tensors(Path(path), tensors, header)
+            write_tensors(path, tensors, header)
         except OSError as error:
             raise InputError(f"cannot write prior {path}: {error.strerror}") from error
 
 
 _ARRAYS = ("action_low", "action_high", "probe_observations", "probe_actions")
 _HEADER = ("task", "logs_hash", "training", "asks")
+
+
+def require_prior_place(path: str | Path) -> Path:
+    """`path` as a Path; raises `InputError` unless a prior can be written there, in the place of none or of another."""
+    path = require_place("prior", path)
+    if path.exists() and kind_of(path) != "prior":
+        raise InputError(f"prior {path} is there already and is no prior: name a new file")
+    return path
 
 
 @partial(jax.jit, static_argnames="solver")
@@ -159,6 +177,8 @@ def _sample(network, observations, condition, noise, solver):
 
 def load_prior(path: str | Path) -> Prior:
     """The prior that was saved to `path`."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"prior must be a Prior, or the path of one, not {path!r}")
     tensors, header = read_tensors(Path(path), kind="prior", newest=FORMAT)
     if header["format"] < FORMAT:
         raise InputError(f"{path} was written by an older ppo-dap: fit the prior again with `ppo-dap pretrain`")

@@ -23,7 +23,7 @@ from ppo_dap.nets.arrays import on_device
 from ppo_dap.nets.normalizer import RewardScale, RunningMoments
 from ppo_dap.nets.policy import Policy, load_policy
 from ppo_dap.priors import Prior, load_prior, random_prior
-from ppo_dap.storage import write_atomically
+from ppo_dap.storage import require_folder, write_atomically
 from ppo_dap.tasks import TaskSpec, describe
 from ppo_dap.training.ahead import CompileAhead
 from ppo_dap.training.algorithm import Frozen, Stages, create_learner
@@ -49,7 +49,10 @@ class Run:
     @cached_property
     def policy(self) -> Policy:
         """The policy at the run's end: numpy in, numpy out, deterministic, the normaliser inside."""
-        return load_policy(self.folder / "policy.safetensors")
+        path = self.folder / "policy.safetensors"
+        if not path.is_file():
+            raise InputError(f"no policy file at {path}: a run has one at its end; go on with `ppo-dap train --resume`")
+        return load_policy(path)
 
     @property
     def metrics(self) -> list[dict[str, Any]]:
@@ -239,8 +242,7 @@ def _check_logs(config: Config, logs: Any, spec: TaskSpec) -> Logs | None:
 def _check_folder(folder: Path, description: dict[str, Any], resume: bool) -> None:
     """Refuse to write over a run, and to resume one as another."""
     path = folder / "config.json"
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"out {folder} is a file: name a folder")
+    require_folder("out", folder)
     if not path.is_file():
         if resume:
             raise InputError(f"nothing to resume in {folder}: it has no config.json")

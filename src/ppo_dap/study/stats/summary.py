@@ -116,3 +116,6 @@ def print_summary(rows: Sequence[dict[str, Any]], epochs: float, title: str | No
     for row in rows:
         table.add_row(*cells(row))
     Console(width=120).print(table)
+    for row in rows:
+        if not row["finished"]:
+            print(f"not finished: {row['run']}, which is to have {row['steps']:,} steps")
