@@ -164,10 +164,16 @@ BAD_BATCHES = {
     "observations of another width": (changed(observations=lambda x: x[:, :2]), r"observations .*should have \(n, 3\)"),
     "one observation": (changed(observations=lambda x: x[0]), r"observations has shape \(3,\)"),
     "actions of another width": (changed(actions=lambda x: x[:, :1]), r"actions .*should have \(64, 2\)"),
-    "fewer rewards": (changed(rewards=lambda x: x[1:]), r"rewards .*should have \(64\)"),
+    "fewer rewards": (changed(rewards=lambda x: x[1:]), r"rewards .*should have \(64,\)"),
     "a column of values": (changed(next_values=lambda x: x[:, None]), r"next_values has shape \(64, 1\)"),
     "fewer ends": (changed(terminated=lambda x: x[1:]), "terminated has shape"),
     "fewer flags": (lambda batch: batch | {"valid": np.ones(ROWS - 1, bool)}, "valid has shape"),
+    "words": (
+        lambda batch: batch | {"rewards": np.full(ROWS, "good")},
+        r"rewards is a ndarray, should be numbers .* \(64,\)",
+    ),
+    "no flag": (changed(terminated=lambda x: 2.0 * x), "terminated has 2, should be False or True"),
+    "half valid": (lambda batch: batch | {"valid": np.full(ROWS, 0.5)}, r"valid has 0\.5, should be False or True"),
     "NaN": (changed(rewards=first(np.nan)), "rewards has NaN"),
     "infinite": (changed(observations=first(np.inf)), "observations has NaN or infinite"),
     "too few rows": (rows(16), "16 rows is smaller than minibatch_size 32"),
@@ -195,6 +201,7 @@ def test_a_bad_batch_is_refused_in_one_line_and_changes_nothing(prior, batch, na
         ({"beta_max": -1.0}, "beta_max must be"),
         ({"mode_seeking": 0.5}, "mode_seeking 0.5 needs this package's own PPO: a Guide has 0.0"),
         ({"std_floor": 0.3}, "std_floor 0.3 needs this package's own PPO: a Guide has 0.0"),
+        ({"warm_start": "actor"}, "warm_start 'actor' needs this package's own PPO: a Guide has 'none'"),
         ({"preset": "tuned", "q_target": "gae"}, "q_target 'gae' needs this package's own PPO: a Guide has 'td'"),
     ],
 )
@@ -202,6 +209,11 @@ def test_bad_options_are_refused_in_one_line(prior, options, message):
     with pytest.raises(InputError, match=message) as caught:
         guide_of(prior, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_it_takes_a_prior_by_its_file(prior, batch, tmp_path):
+    prior.save(tmp_path / "prior")
+    assert_same(guide_of(tmp_path / "prior")(**batch), guide_of(prior)(**batch))
 
 
 def test_of_a_preset_it_has_all_but_what_needs_the_policy(prior, batch):

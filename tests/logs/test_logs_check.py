@@ -47,6 +47,17 @@ def test_wrong_dimensions_are_an_error():
     assert message(report, "dimensions").startswith(expected)
 
 
+def test_a_bound_can_be_one_number_for_all_actions():
+    actions = 5 * policy_logs().actions
+    one, each = (
+        check_logs(policy_logs(actions=actions), 3, low, high) for low, high in ((-2, 2), ([-2, -2.0], [2.0, 2]))
+    )
+    assert message(one, "action bounds") == message(each, "action bounds")
+    assert level(one, "action bounds") == "warning"
+    with pytest.raises(InputError, match=r"action_low .*low.* must be a number, or one for each action"):
+        check_logs(policy_logs(), 3, np.array("low"), 2)
+
+
 def test_actions_outside_the_space():
     actions = policy_logs().actions.copy()
     actions[[3, 4], 1] = [1.5, -2.0]

@@ -81,6 +81,21 @@ def test_observations_of_another_shape_are_refused(policy, shape):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        ([[0, 0, 0], [0, np.nan, 0]], r"observation is nan at \[1, 1\]"),
+        ([0, 0, np.nan], r"observation is nan at \[2\]"),
+        (["a", "b", "c"], "observation must be numbers, not"),
+        ([[0, 0, 0], [0]], "observation must be numbers, not"),
+    ],
+)
+def test_observations_that_are_no_numbers_are_refused(policy, observation, message):
+    with pytest.raises(InputError, match=message) as caught:
+        policy(observation)
+    assert "\n" not in str(caught.value)
+
+
 def test_log_prob_of_noise_is_that_of_the_action_it_makes(policy):
     noise = np.random.default_rng(0).standard_normal((50, 2), dtype=np.float32)
     mean, std = policy.mean(observations()), np.exp(policy.log_std)

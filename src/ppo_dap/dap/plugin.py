@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -31,12 +32,13 @@ from ppo_dap.methods import METHODS, resolve
 from ppo_dap.nets.normalizer import RunningMoments
 from ppo_dap.nets.policy import scale_actions
 from ppo_dap.ppo.update import draw_orders
-from ppo_dap.priors import Prior
+from ppo_dap.priors import Prior, load_prior
 
 _WITHOUT_OUR_PPO = {
     "q_target": "td", "q_calibration": "none", "guidance_gate": False, "mode_seeking": 0.0, "std_floor": 0.0,
+    "warm_start": "none", "q_warm_start": False,
 }  # fmt: skip
-"""What needs the advantages or the policy, which a Guide is not given; a preset that has it is used without."""
+"""What needs the advantages, the policy or the logs. A Guide is given none, and uses a preset that has it without."""
 
 
 class Guide:
@@ -48,14 +50,16 @@ class Guide:
     states (Eq. 9), and nothing to ratios or advantages. Everything is in environment units.
     """
 
-    def __init__(self, prior: Prior, *, total_iterations: int, preset: str = "paper", **options: Any):
-        """`total_iterations` of the run, for the annealing of beta; `options` are fields of `Config` by name.
+    def __init__(self, prior: Prior | str | Path, *, total_iterations: int, preset: str = "paper", **options: Any):
+        """`prior`, or its file; `total_iterations` of the run, for the annealing of beta; `options` are fields of
+        `Config` by name.
 
         Q has a trunk of its own here, since this PPO's value network is not ours to read, and a preset's `mode_seeking`
         is left out, since the policy is not either.
         """
         if not isinstance(total_iterations, int) or total_iterations < 1:
             raise InputError(f"total_iterations must be a whole number above 0, not {total_iterations!r}")
+        prior = prior if isinstance(prior, Prior) else load_prior(prior)
         given = options | {"q_trunk": "separate"}
         for name, right in _WITHOUT_OUR_PPO.items():
             if given.get(name, right) != right:
@@ -133,8 +137,8 @@ class Guide:
             raise InputError(f"a batch of {n} rows must be a multiple of minibatch_size {ppo.minibatch_size}")
         actions = _checked("actions", actions, (n, prior.action_size))
         rewards, next_values = _checked("rewards", rewards, (n,)), _checked("next_values", next_values, (n,))
-        ended = _checked("terminated", terminated, (n,)) > 0
-        weights = np.ones(n, np.float32) if valid is None else _checked("valid", valid, (n,))
+        ended = _flags("terminated", terminated, n) > 0
+        weights = np.ones(n, np.float32) if valid is None else _flags("valid", valid, n)
         # Q's targets are scaled to spread 1, as PPO's scaled rewards would make them: guidance strengths mean the same.
         targets = rewards + ppo.gamma * np.where(ended, 0.0, next_values)
         self._rewards = self._rewards.update(targets[weights > 0][:, None])
@@ -167,12 +171,23 @@ class Guide:
 
 def _checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
     """`value` as float32 of the given shape (None: any), or an `InputError` that says what is wrong with it."""
-    array = np.asarray(value, dtype=np.float32)
+    wanted = str(tuple("n" if want is None else want for want in shape)).replace("'", "")
+    try:
+        array = np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is a {type(value).__name__}, should be numbers of shape {wanted}") from None
     if array.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
     ):
-        wanted = "(" + ", ".join("n" if want is None else str(want) for want in shape) + ")"
         raise InputError(f"{name} has shape {array.shape}, should have {wanted}")
     if not np.isfinite(array).all():
         raise InputError(f"{name} has NaN or infinite entries")
+    return array
+
+
+def _flags(name: str, value: ArrayLike, n: int) -> np.ndarray:
+    """`value` as n numbers that are 0 or 1."""
+    array = _checked(name, value, (n,))
+    if (wrong := array[(array != 0) & (array != 1)]).size:
+        raise InputError(f"{name} has {wrong[0]:g}, should be False or True in every row")
     return array

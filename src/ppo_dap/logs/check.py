@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float32
 
 from ppo_dap.errors import InputError
 from ppo_dap.logs.check_columns import check_actions, check_constant, check_duplicated_columns, check_duplicated_rows
@@ -17,7 +17,7 @@ from ppo_dap.logs.check_episodes import (
     check_terminations,
     check_time_step,
 )
-from ppo_dap.logs.dataset import Logs, LogsWarning
+from ppo_dap.logs.dataset import Logs, LogsWarning, require_logs
 from ppo_dap.logs.finding import Finding, Report
 from ppo_dap.logs.jumps import find_jumps
 from ppo_dap.logs.neighbours import Mixture, Neighbours, find_mixture, find_neighbours
@@ -29,25 +29,30 @@ SPREAD = 0.95
 NEAR = 0.5
 """Neighbours further apart than this, over the distance of any two rows, say nothing about one state's actions."""
 
+Bound = np.ndarray | Sequence[int | float] | int | float
+"""Of every action, or one for each."""
+
 
 def check_logs(
     logs: Logs,
     observation_size: int | None = None,
-    action_low: Float32[np.ndarray, " task_act"] | None = None,
-    action_high: Float32[np.ndarray, " task_act"] | None = None,
+    action_low: Bound | None = None,
+    action_high: Bound | None = None,
     task: str | None = None,
 ) -> Report:
     """Check `logs` against a task (its id, sizes and action bounds, in environment units) and for bad logging.
 
-    Bounds that are not given are taken from the logs, if those know them. Nothing is raised: other dimensions than the
-    task's are a finding of level "error". What would cost too much on large logs is done on rows drawn by a fixed
-    seed, and the message says on how many. docs/check-logs.md says what each finding means.
+    A bound is a number, or one for each action; what is not given is taken from the logs, if those know it. No logs
+    are refused: other dimensions than the task's are a finding of level "error". What would cost too much on large
+    logs is done on rows drawn by a fixed seed, and the message says on how many. docs/check-logs.md says what each
+    finding means.
     """
-    action_size = None if action_low is None else len(action_low)
-    findings = [_task(logs, task), _dimensions(logs, observation_size, action_size)]
-    if action_low is None or action_high is None:
-        action_low, action_high = logs.action_low, logs.action_high
-    findings += check_actions(logs, action_low, action_high)
+    require_logs(logs)
+    low, high = _bound("action_low", action_low, logs), _bound("action_high", action_high, logs)
+    findings = [_task(logs, task), _dimensions(logs, observation_size, None if low is None else len(low))]
+    if low is None or high is None:
+        low, high = logs.action_low, logs.action_high
+    findings += check_actions(logs, low, high)
     findings += [check_constant("observations", logs.observations), check_constant("actions", logs.actions)]
     findings += [check_duplicated_columns(logs), check_duplicated_rows(logs)]
     jumps, neighbours = find_jumps(logs), find_neighbours(logs)
@@ -56,6 +61,16 @@ def check_logs(
     findings += [check_next_observations(logs), check_time_step(logs), check_returns(logs)]
     findings += [_spread(neighbours), _mixture(mixture)]
     return Report(tuple(findings), jumps, neighbours, mixture)
+
+
+def _bound(name: str, value: Bound | None, logs: Logs) -> np.ndarray | None:
+    if value is None:
+        return None
+    try:
+        bound = np.asarray(value, np.float32)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} {value!r} must be a number, or one for each action") from None
+    return np.full(logs.action_size, bound) if bound.ndim == 0 else bound.ravel()
 
 
 def require_compatible(logs: Logs, *, task: str, observation_size: int, action_size: int) -> None:

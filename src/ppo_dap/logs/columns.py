@@ -38,9 +38,13 @@ def choose_columns(names: Sequence[str], columns: Columns | None) -> tuple[dict[
     without observations or actions.
     """
     columns = columns or {}
-    for role in columns:
+    if not isinstance(columns, Mapping):
+        raise InputError(f"columns is {columns!r}: must say for each role which columns it has, as a mapping")
+    for role, given in columns.items():
         if role not in ROLES:
             raise unknown("role in columns", role, ROLES)
+        if given is not None and not isinstance(given, str | Sequence):
+            raise InputError(f"columns has {role} {given!r}: must be a column's name, or several")
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise InputError(f"column {min(twice)!r} is there twice: must be there once")

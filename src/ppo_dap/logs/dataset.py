@@ -291,3 +291,9 @@ def _bounds(low: np.ndarray | None, high: np.ndarray | None, action_size: int) -
         values = f"{bounds['action_low'][column]} and action_high {bounds['action_high'][column]}"
         raise InputError(f"action_low is {values} in column {column}: action_low must be below action_high")
     return bounds
+
+
+def require_logs(logs: object) -> None:
+    """Raise `InputError` for what is not `Logs`, such as the path of some."""
+    if not isinstance(logs, Logs):
+        raise InputError(f"logs must be Logs, as ppo_dap.load_logs reads them, not a {type(logs).__name__}")

@@ -64,6 +64,8 @@ def load_logs(
 
 
 def _read(source: str | os.PathLike, columns: Columns | None, budget: Budget) -> Logs:
+    if not isinstance(source, str | os.PathLike):
+        raise InputError(f"logs source is a {type(source).__name__}: {_choices()}")
     name = os.fspath(source)
     if not name:
         raise InputError(f"logs source is empty: {_choices()}")

@@ -70,14 +70,19 @@ class Policy:
     def __call__(self, observation) -> np.ndarray:
         """Deterministic action in environment units for one observation (obs,) or a batch (n, obs).
 
-        Raises `InputError` if the observation has another size than the policy was trained with.
+        Raises `InputError` if the observation has another size than the policy was trained with, or NaN in it.
         """
-        observations = np.asarray(observation, dtype=np.float32)
+        try:
+            observations = np.asarray(observation, dtype=np.float32)
+        except (TypeError, ValueError):
+            raise InputError(f"observation must be numbers, not {observation!r}") from None
         if observations.ndim not in (1, 2) or observations.shape[-1] != len(self.observation_mean):
             raise InputError(
                 f"observation of shape {observations.shape}: this policy takes ({len(self.observation_mean)},) or "
                 f"(n, {len(self.observation_mean)})"
             )
+        if (nan := np.argwhere(np.isnan(observations))).size:
+            raise InputError(f"observation is nan at {nan[0].tolist()}: this policy takes numbers")
         actions = self.unscale(self.mean(np.atleast_2d(observations)))
         return actions if observations.ndim == 2 else actions[0]
 

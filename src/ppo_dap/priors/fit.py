@@ -15,7 +15,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from ppo_dap.errors import InputError, TrainingDiverged, unknown
-from ppo_dap.logs.dataset import Logs
+from ppo_dap.logs.dataset import Logs, require_logs
 from ppo_dap.nets.arrays import first_state, on_device
 from ppo_dap.prior_config import FITTED, PRIOR_CONFIGS
 from ppo_dap.priors.kinds import NETWORKS
@@ -71,8 +71,11 @@ def fit_prior(
     Options are the fields of the kind's config (`DiffusionConfig` and so on), and `action_low` and `action_high` for
     logs that do not carry the action space's bounds, or carry infinite ones.
     """
+    require_logs(logs)
     if kind not in FITTED:
         raise unknown("prior kind", kind, FITTED)
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"seed must be a whole number of 0 or more, not {seed!r}")
     config_class = PRIOR_CONFIGS[kind]
     low, high, options = _bounds(logs, options)
     known = [f.name for f in dataclasses.fields(config_class)]

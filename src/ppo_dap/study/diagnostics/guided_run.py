@@ -157,9 +157,14 @@ def load_guided(
     or of other networks.
     """
     run = load_run(folder)
-    if get_method(run.config["method"]).prior == "none":
+    kind = get_method(run.config["method"]).prior
+    if kind == "none":
         raise InputError(f"{folder} is a run of {run.config['method']}: it has no Q head, and nothing it would guide")
     found = prior if isinstance(prior, Prior) else load_prior(prior)
+    if found.kind not in (kind, "random"):
+        raise InputError(
+            f"prior {prior} is of kind {found.kind!r}, {folder} was trained with a {kind} prior: name that"
+        )
     if found.logs_hash != run.config["prior_hash"]:
         raise InputError(f"prior {prior} was fitted to other logs than the prior that {folder} was trained with")
     config = configs.replace(Config(), **run.config["config"])
