@@ -50,6 +50,7 @@ def made(tmp_path_factory):
     prior = Prior(denoiser, -one, one, "Hopper-v5", logs.hash(), {}, *probe)
     prior.save(folder / "prior")
     dataclasses.replace(prior, logs_hash="other").save(folder / "other")
+    ppo_dap.fit_prior(logs, "retrieval", action_low=-1, action_high=1).save(folder / "retrieval")
     ppo_dap.train("Hopper-v5", "ppo-dap", prior=prior, out=folder / "run", progress=False, **SMALL)
     (folder / "plain").mkdir()
     description = json.loads((folder / "run" / "config.json").read_text()) | {"method": "ppo", "prior_hash": None}
@@ -175,6 +176,7 @@ def test_a_task_that_cannot_be_restored_is_read_from_its_trajectory(made, monkey
     [
         ("plain", "prior", {}, "a run of ppo: it has no Q head"),
         ("run", "other", {}, "fitted to other logs"),
+        ("run", "retrieval", {}, "retrieval is of kind 'retrieval', .*run was trained with a diffusion prior"),
         ("run", "prior", {"states": 1}, "states 1 must be at least 2"),
         ("run", "prior", {"horizon": 0}, "horizon 0 must be at least 1"),
     ],

@@ -279,6 +279,13 @@ def test_a_run_that_has_only_begun_is_summarised(capsys, folders, tmp_path):
 
 
 @pytest.mark.usefixtures("fair")
+def test_the_table_names_what_is_not_finished(capsys, folders):
+    assert main(["summary", *folders, "--epochs", "5"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "not finished" in line]
+    assert lines == [f"not finished: {folders[4]}, which is to have 50,000 steps"]
+
+
+@pytest.mark.usefixtures("fair")
 def test_rows_of_runs_as_csv(folders, tmp_path):
     assert main(["summary", *folders, "--epochs", "10", "--csv", "runs.csv"]) == 0
     with open(tmp_path / "runs.csv") as file:
