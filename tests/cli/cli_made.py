@@ -1,6 +1,7 @@
 """Files that a command can be given: logs, priors and runs, whole and damaged."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -10,6 +11,13 @@ from safetensors.numpy import save_file
 
 from ppo_dap.config import Config, flatten
 
+DAMAGED = (
+    ("run-audit-cut", "audit.json", '{"static": ['),
+    ("run-audit-bare", "audit.json", "{}"),
+    ("run-rowless", "evaluations.jsonl", ""),
+    ("run-list", "evaluations.jsonl", "[1, 2]\n"),
+)
+"""Runs of which one file is not what it was: (name, file, what is in it)."""
 TASK = "Pendulum-v1"  # 3 observations, 1 action in [-2, 2], no EnvPool to wait for
 
 
@@ -107,6 +115,9 @@ def write_runs(folder):
     policy.save(folder / "run" / "policy.safetensors")
     meta = {"meta": json.dumps({"kind": "policy", "format": 99})}
     save_file({"a": np.zeros(2)}, folder / "run-newer" / "policy.safetensors", meta)
+    for name, file, text in DAMAGED:
+        shutil.copytree(folder / "run", folder / name)
+        (folder / name / file).write_text(text)
     (folder / "damaged").mkdir()
     (folder / "damaged" / "config.json").write_text('{"task": "Pend')
     (folder / "other").mkdir()

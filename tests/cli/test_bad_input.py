@@ -180,6 +180,11 @@ BAD = {
         for command, tail in (("evaluate", ""), ("audit", ""), ("summary", ""), ("collect", " --out out.npz"))
         for what, words in (("other", "not a run folder"), ("nothing", "no config.json"), ("damaged", "damaged"))
     },
+    "audit cut": ("audit @run-audit-cut", "audit.json is damaged", "what `ppo-dap train` wrote"),
+    "summary of audit cut": ("summary @run-audit-cut", "audit.json is damaged"),
+    "audit without claims": ("audit @run-audit-bare", "audit.json is damaged ('static')"),
+    "evaluate without evaluations": ("evaluate @run-rowless", "run-rowless has no row in evaluations.jsonl"),
+    "evaluate of lists": ("evaluate @run-list", "evaluations.jsonl is damaged", "line 1 is [1, 2]", "must be"),
     "audit of no audit": ("audit @run", "has no audit.json"),
     "evaluate without policy": ("evaluate @run-policyless", "no policy file at", "--resume"),
     "evaluate newer": ("evaluate @run-newer", "policy format 99", "reads up to", "update ppo-dap"),

@@ -12,6 +12,7 @@ from ppo_dap.priors.prior import Prior, load_prior
 
 def saved(prior, folder):
     path = folder / "prior"
+    path.unlink(missing_ok=True)  # it may be one that a test has damaged
     prior.save(path)
     return path
 

@@ -29,7 +29,10 @@ def evaluate(options: argparse.Namespace) -> int:
         require_video(options.video)
     task = options.task or run.config["task"]
     _require_same_sizes(run, task)
-    row = evaluate_policy(run.policy, task, options.episodes, options.seed).row(run.evaluations[-1]["env_steps"])
+    known = run.evaluations
+    if not known:
+        raise InputError(f"{run.folder} has no row in evaluations.jsonl: is it a whole run folder?")
+    row = evaluate_policy(run.policy, task, options.episodes, options.seed).row(known[-1]["env_steps"])
     if options.json:
         print(json.dumps(row))
     else:

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from ppo_dap.errors import InputError
+
 TABLES = ("metrics", "evaluations")
 
 
@@ -64,6 +66,8 @@ def read_table(folder: Path, table: str) -> list[dict[str, Any]]:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
             break
+        if not isinstance(rows[-1], dict):
+            raise InputError(f"{path} is damaged: line {len(rows)} is {line[:40]}, must be an object of named numbers")
     return rows
 
 

@@ -75,7 +75,10 @@ class Run:
         path = self.folder / "audit.json"
         if not path.is_file():
             raise InputError(f"{self.folder} has no audit.json: is it a run folder?")
-        static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
+        try:
+            static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
+        except (ValueError, LookupError, TypeError) as error:
+            raise InputError(f"{path} is damaged ({error}): it must be what `ppo-dap train` wrote") from error
         guided, config = self.config["prior_hash"] is not None, self.config["config"]
         rows = self.metrics
         starts = [0, *(row["env_steps"] for row in rows[:-1])]
