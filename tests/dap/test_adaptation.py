@@ -35,7 +35,7 @@ def pet(states):
 
     From step `changed` on the random numbers are others.
     """
-    batch = Batch(jnp.asarray(64, jnp.int32), jnp.asarray(states), jnp.asarray(WEIGHTS, jnp.float32))
+    batch = Batch(jnp.asarray(64, jnp.int32), *map(jnp.asarray, (states, WEIGHTS.astype(np.float32), states)))
     config = AdaptationConfig(pet_minibatch_size=16, pet_learning_rate=1e-3)
     run = jax.jit(partial(adapt, config=config, check=lambda ids, seen: provenance(ids, seen, batch)))
 

@@ -71,7 +71,7 @@ def test_pgshare_is_ppos_gradient_over_the_actors(learner, frozen, stages, confi
 
 
 def test_an_open_gate_shows_in_oglr(learner, frozen, stages, monkeypatch):
-    monkeypatch.setattr(objective, "provenance", lambda ids, states, batch: jnp.ones(len(ids)))
+    monkeypatch.setattr(objective, "provenance", lambda ids, *_: jnp.ones(len(ids)))
     open_stages = copy.copy(stages)
     open_stages.leakage = Stages(small_config(), guided=True).leakage
     (row,) = measured(learner, frozen, open_stages)
@@ -121,6 +121,21 @@ def test_proposals_for_states_outside_d_on_are_found(learner, frozen, stages, mo
     rows = measured(learner, frozen, leaking)
     assert violated(audit.measured_claims(rows)) == {SPR}
     assert rows[0]["spr"] == 0.5
+
+
+def test_proposals_that_the_policy_imitates_on_other_states_are_found(learner, frozen, stages, monkeypatch):
+    """The prior sees the states that the ids name; what the policy sees beside its proposals is other rows of D_on."""
+    real = guide.States
+
+    def shifted(ids, raw, observations, features):
+        return real(ids, raw, jnp.roll(observations, 1, axis=0), features)
+
+    monkeypatch.setattr(guide, "States", shifted)
+    leaking = copy.copy(stages)
+    leaking.propose = Stages(small_config(), guided=True).propose
+    rows = measured(learner, frozen, leaking)
+    assert violated(audit.measured_claims(rows)) == {SPR}
+    assert rows[0]["spr"] == 0
 
 
 def test_logged_rows_in_pet_are_found(learner, frozen, stages):
@@ -187,3 +202,35 @@ def test_a_metric_that_is_no_number_does_not_pass(name, place):
     rows = [dict(GOOD), dict(GOOD)]
     rows[place][name] = float("nan")
     assert len(violated(audit.measured_claims(rows))) == 1
+
+
+def test_an_iteration_without_a_row_is_not_passed_over():
+    rows = [dict(GOOD, iteration=i, env_steps=10 * i) for i in range(1, 6)]
+    assert audit.every_iteration(rows, 50) == audit.every_iteration(rows, 0) == rows
+    for gone, steps in (([2], 50), ([0], 50), ([4], 50), ([1, 3], 0)):
+        left = audit.every_iteration([row for i, row in enumerate(rows) if i not in gone], steps)
+        assert left.count({}) == len(gone)
+        assert violated(audit.measured_claims(left)) == {FRESH, RATIO_1, SPR, PET_SPR, OGLR}
+    assert audit.every_iteration([], 10) == [{}]
+    # Rows that are there twice, or in another order, are all looked at.
+    bad = dict(rows[2], spr=0.5)
+    assert violated(audit.measured_claims(audit.every_iteration([*rows[:3], bad, *rows[3:]], 50))) == {SPR}
+    assert {} in audit.every_iteration([rows[0], rows[2], rows[1], *rows[3:]], 50)
+
+
+def test_what_was_proved_before_a_run_was_cut_off_still_counts():
+    holds, broken = (audit.Claim("(i)", "V", value, "") for value in (True, False))
+    other = audit.Claim("(iv)", "logs", True, "")
+    assert audit.both([holds, other], [broken]) == audit.both([broken, other], [holds]) == [broken, other]
+    assert audit.both([], [holds, other]) == audit.both([holds], [holds, other]) == [holds, other]
+
+
+def test_a_clause_without_a_proof_does_not_hold():
+    proofs = [audit.Claim(clause, "", True, "") for clause in ("(i)", "(iv)")]
+    assert audit.require_proofs(proofs) == proofs
+    for kept in ([], proofs[:1], proofs[1:]):
+        found = audit.require_proofs(kept)
+        assert [claim.clause for claim in found] == [p.clause for p in kept] + [
+            p.clause for p in proofs if p not in kept
+        ]
+        assert violated(found) == {"a proof on the traced update"}

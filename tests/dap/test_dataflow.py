@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 from jax.ad_checkpoint import checkpoint_name
 
-from ppo_dap.dap.dataflow import trace
+from ppo_dap.dap.dataflow import KNOWN, UNKNOWN, trace
 
 ARGUMENTS = {name: jnp.arange(1.0, 4.0) for name in "abc"}
 
@@ -133,3 +133,28 @@ def test_what_is_not_returned_does_not_count():
     flow = flow_of(diagnosed)
     assert flow.tags == {}
     assert flow.outputs == {"x": {"a"}, "y": {"a"}}
+
+
+TABLE = jnp.arange(3.0)
+OWNERLESS = {
+    "a closure's array": lambda a: a + jax.jit(lambda p: p * TABLE)(a),
+    "a constant array": lambda a: a + TABLE,
+    "a callback": lambda a: a + jax.pure_callback(lambda: 1.0, jax.ShapeDtypeStruct((), jnp.float32)),
+}
+
+
+@pytest.mark.parametrize("name", OWNERLESS)
+def test_what_has_no_owner_is_unknown_unless_a_tag_says_that_it_is_no_data(name):
+    found = flow_of(lambda a, b, c: {"x": OWNERLESS[name](a), "y": b, "z": checkpoint_name(OWNERLESS[name](c), KNOWN)})
+    assert found.outputs == {"x": {"a", *UNKNOWN}, "y": {"b"}, "z": {"c"}}
+
+
+def test_what_is_read_from_a_mutable_array_is_unknown():
+    def mutable(a, b, c):
+        box = jax.new_ref(b)
+        box[...] = a
+        return {"x": box[...], "y": c}
+
+    found = flow_of(mutable)
+    assert found.outputs["x"] >= UNKNOWN
+    assert found.outputs["y"] == {"c"}

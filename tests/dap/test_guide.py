@@ -11,7 +11,8 @@ from ppo_dap.dap.objective import Batch
 from ppo_dap.dap.proposals import Proposals
 
 STATES = np.random.default_rng(0).standard_normal((8, OBS)).astype(np.float32)
-BATCH = Batch(jnp.asarray(40, jnp.int32), jnp.asarray(STATES), jnp.asarray([1, 1, 0, 1, 1, 1, 1, 1], jnp.float32))
+WEIGHTS = jnp.asarray([1, 1, 0, 1, 1, 1, 1, 1], jnp.float32)
+BATCH = Batch(jnp.asarray(40, jnp.int32), jnp.asarray(STATES), WEIGHTS, jnp.asarray(STATES))
 
 
 def proposed(rows, wanted, q_spread, ess):

@@ -138,7 +138,7 @@ def test_no_gradient_reaches_the_proposals(actor):
 
 
 STATES = numbers(4, 3, seed=8)
-BATCH = Batch(jnp.asarray(200, jnp.int32), jnp.asarray(STATES), jnp.asarray([1.0, 1.0, 0.0, 1.0]))
+BATCH = Batch(jnp.asarray(200, jnp.int32), jnp.asarray(STATES), jnp.asarray([1.0, 1.0, 0.0, 1.0]), jnp.asarray(STATES))
 STRANGE = STATES[3] + np.float32([0, 0, 1e-6])
 CASES = [
     ("first row", 200, STATES[0], 1),

@@ -98,7 +98,7 @@ def test_a_leak_in_either_update_is_found(tmp_path, monkeypatch, hopper_prior, s
     options = OPTIONS | {"steps": 256}
     found = ppo_dap.train("Hopper-v5", prior=hopper_prior, out=tmp_path / "run", **options, **small).audit()
     assert ["V and its trunk" in claim.statement for claim in found if not claim.holds] == [True]
-    assert len(found) == len({claim.statement for claim in found}) == 11
+    assert len(found) == len({claim.statement for claim in found}) == 13
 
 
 def test_the_last_checkpoint_of_the_guide_is_kept(run, hopper_prior):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ppo_dap.config import Config, ProposalConfig
-from ppo_dap.dap.dataflow import Flow
+from ppo_dap.dap.dataflow import UNKNOWN, Flow
 from ppo_dap.dap.objective import Batch, GatedProposals, Weights, added_terms, admit, admit_proposals
 from ppo_dap.dap.proposals import Proposals, conditions, gaussian_proxy
 from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob, tree_norm
@@ -167,57 +167,61 @@ class Claim:
         return f"{'holds   ' if self.holds else 'VIOLATED'} {self.clause:6} {self.statement}: {self.evidence}"
 
 
+_GUIDES = frozenset({"proposals", "offline", "backbone", "adapters", "q"})
 FORBIDDEN: tuple[tuple[str, str, str, str, frozenset[str]], ...] = (
-    # clause, statement, which flow, output or tag, labels that must not reach it
+    # clause, statement, in the flow without what this tag carries, output or tag, labels that must not reach it
+    ("(i)", "the importance ratio is made of theta and D_on", "theta", "tag:ratio", _GUIDES | {"previous"}),
+    ("(i)", "the advantages are made of V and D_on", "", "tag:advantages", _GUIDES | {"previous"}),
     (
         "(i)",
-        "the importance ratio is made of theta and D_on",
-        "cut",
-        "tag:ratio",
-        frozenset({"proposals", "offline", "backbone", "adapters", "q", "previous"}),
-    ),
-    (
-        "(i)",
-        "the advantages are made of V and D_on",
-        "full",
-        "tag:advantages",
-        frozenset({"proposals", "offline", "backbone", "adapters", "q", "previous"}),
+        "the new policy less what Eq. 9 adds is made of theta, V and D_on",
+        "added",
+        "out:actor",
+        _GUIDES | {"previous"},
     ),
     (
         "(i)",
         "V and its trunk learn from D_on alone, not from Q or proposals",
-        "full",
+        "",
         "out:critic",
-        frozenset({"proposals", "offline", "backbone", "adapters", "q", "previous"}),
+        _GUIDES | {"previous", "actor"},
+    ),
+    (
+        "(ii)",
+        "prior and Q reach the policy as proposals alone",
+        "proposals",
+        "out:actor",
+        frozenset({"backbone", "adapters", "q"}),
     ),
     (
         "(iii)",
         "PET's gradient is made of D_on and the prior, not of actor, critic, Q, proposals or logs",
-        "full",
+        "",
         "out:adapters",
-        frozenset({"proposals", "offline", "actor", "critic", "q", "ppo_optimizers", "previous"}),
+        frozenset({"proposals", "offline", "actor", "critic", "q", "previous"}),
     ),
-    ("(iv)", "no array of D_off reaches the new policy", "full", "out:actor", frozenset({"offline"})),
-    ("(iv)", "no array of D_off reaches the optimizers, Q or the prior", "full", "out:rest", frozenset({"offline"})),
+    ("(iv)", "no array of D_off reaches the new policy", "", "out:actor", frozenset({"offline"})),
+    ("(iv)", "no array of D_off reaches the optimizers, Q or the prior", "", "out:rest", frozenset({"offline"})),
 )
 
 
-def static_claims(full: Flow, cut: Flow) -> list[Claim]:
-    """The data-flow proof: `full` is the traced update, `cut` the same with theta taken as given at each minibatch.
+def static_claims(flow: Callable[[str], Flow]) -> list[Claim]:
+    """The data-flow proof: `flow(tag)` is that of the traced update with what carries the tag taken as given, all of it
+    where the tag is "".
 
-    The cut is needed since proposals do reach theta, through Eq. 9, and theta reaches the next minibatch's ratio.
+    Proposals do reach theta, through Eq. 9, and theta reaches the next minibatch's ratio: hence the cuts. Nothing may
+    be reached by what has no owner.
     """
-    claims = []
-    for clause, statement, which, where, forbidden in FORBIDDEN:
-        flow = cut if which == "cut" else full
+    claims, flows = [], {cut: flow(cut) for cut in sorted({row[2] for row in FORBIDDEN})}
+    for clause, statement, cut, where, forbidden in FORBIDDEN:
         kind, name = where.split(":")
-        found = flow.tags if kind == "tag" else flow.outputs
+        found = flows[cut].tags if kind == "tag" else flows[cut].outputs
         if name not in found:
             if name == "adapters":
                 continue
             claims.append(Claim(clause, statement, False, f"{name} was not found in the traced program"))
             continue
-        reached = found[name] & forbidden
+        reached = found[name] & (forbidden | UNKNOWN)
         evidence = f"reached by {', '.join(sorted(reached))}" if reached else "proved on the traced program"
         claims.append(Claim(clause, statement, not reached, evidence))
     return claims
@@ -226,7 +230,28 @@ def static_claims(full: Flow, cut: Flow) -> list[Claim]:
 def both(first: Sequence[Claim], then: Sequence[Claim]) -> list[Claim]:
     """Claims on two traced programs, of which a run has one after the other: the one that fails, if one does."""
     later = {claim.statement: claim for claim in then}
-    return [later.get(claim.statement, claim) if claim.holds else claim for claim in first]
+    worse = [later.pop(claim.statement, claim) if claim.holds else claim for claim in first]
+    known = {claim.statement for claim in worse}
+    return worse + [claim for claim in later.values() if claim.statement not in known]
+
+
+def require_proofs(static: Sequence[Claim]) -> list[Claim]:
+    """`static` claims as they were kept, and one that does not hold for each clause whose proof is not among them."""
+    proved = {claim.clause for claim in static}
+    missing = [clause for clause in ("(i)", "(iv)") if clause not in proved]
+    return [*static, *(Claim(clause, "a proof on the traced update", False, "was not kept") for clause in missing)]
+
+
+def every_iteration(rows: Sequence[Mapping[str, Any]], env_steps: int) -> list[Mapping[str, Any]]:
+    """`rows` with an empty one for each iteration that is missing: between them, or after the last if that ends before
+    `env_steps`, which the run is known to have made.
+    """
+    whole: list[Mapping[str, Any]] = []
+    last = 0
+    for row in rows:
+        whole += [{}] * (row["iteration"] - last - 1) + [row]
+        last = row["iteration"]
+    return whole + [{}] * ((rows[-1]["env_steps"] if rows else 0) < env_steps)
 
 
 def _worst(rows: Iterable[Mapping[str, Any]], name: str, largest: bool) -> float | None:

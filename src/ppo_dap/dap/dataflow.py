@@ -3,6 +3,9 @@
 Read off the jaxpr, so off the program that runs and not off its source. Every primitive passes all of its inputs on to
 all of its outputs, except those whose structure is known (loops, branches, calls, barriers), which are followed inside.
 What is reported as unreachable is unreachable; the reverse need not hold.
+
+An array that is in the program and no argument of it (a closure's), what a callback to Python returns and what is read
+from a mutable array have no owner: they carry `UNKNOWN`, since they could be anything.
 """
 
 from __future__ import annotations
@@ -12,11 +15,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend import core as jex
 from jax.interpreters.partial_eval import dce_jaxpr
 
 Labels = frozenset[str]
 NOTHING: Labels = frozenset()
+UNKNOWN: Labels = frozenset({"unknown"})
+KNOWN = "known"
+"""Tag of what is made of constant arrays that are no data, such as a polynomial's coefficients: it takes `UNKNOWN` off.
+"""
 
 
 @dataclass(frozen=True)
@@ -73,10 +81,12 @@ class _Walker:
 
     def run(self, jaxpr: Any, inputs: Sequence[Labels]) -> list[Labels]:
         """Labels of a jaxpr's outputs for labels of its inputs."""
-        env: dict[Any, Labels] = dict(zip(jaxpr.invars, inputs, strict=True))
+        env: dict[Any, Labels] = dict(zip(jaxpr.invars, inputs, strict=True)) | dict.fromkeys(jaxpr.constvars, UNKNOWN)
 
         def read(var) -> Labels:
-            return NOTHING if isinstance(var, jex.Literal) else env.get(var, NOTHING)
+            if isinstance(var, jex.Literal):
+                return UNKNOWN if np.ndim(var.val) else NOTHING
+            return env.get(var, NOTHING)
 
         for eqn in jaxpr.eqns:
             env.update(zip(eqn.outvars, self.equation(eqn, [read(v) for v in eqn.invars]), strict=True))
@@ -87,6 +97,8 @@ class _Walker:
         name, params = eqn.primitive.name, eqn.params
         if name == "name":
             return [self.tag(params["name"], inputs[0])]
+        if "callback" in name or any(hasattr(v.aval, "inner_aval") for v in eqn.invars):
+            return [UNKNOWN.union(*inputs)] * len(eqn.outvars)
         if name == "optimization_barrier":
             return inputs
         if name == "scan":
@@ -108,6 +120,8 @@ class _Walker:
         self.tags[name] = self.tags.get(name, NOTHING) | labels
         if name in self.cuts:
             return frozenset({name})
+        if name == KNOWN:
+            return labels - UNKNOWN
         return labels | {name} if name in self.sources else labels
 
     def scan(self, eqn: Any, inputs: list[Labels]) -> list[Labels]:

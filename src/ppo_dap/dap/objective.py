@@ -17,6 +17,9 @@ from ppo_dap.nets.actor import Actor, gaussian_kl, log_prob
 from ppo_dap.ppo.surrogate import normalise, weighted_mean
 from ppo_dap.ppo.update import Rows
 
+SAME_STATE = 1e-3
+"""Largest difference of a normalised observation to the one that it is."""
+
 
 class Weights(NamedTuple):
     """Weights of Eq. 9 in this iteration."""
@@ -52,16 +55,25 @@ class Batch(NamedTuple):
     """state_id that its first row must have, from the learner's own count of iterations: an old batch has others."""
     raw_observations: Float[Array, "rows obs"]
     weights: Float[Array, " rows"]
+    observations: Float[Array, "rows obs"]
+    """The same as the policy sees them."""
 
 
 def provenance(
-    state_ids: Int[Array, " n"], raw_observations: Float[Array, "n obs"], batch: Batch
+    state_ids: Int[Array, " n"],
+    raw_observations: Float[Array, "n obs"],
+    batch: Batch,
+    observations: Float[Array, "n obs"] | None = None,
 ) -> Float[Array, " n"]:
-    """1 for every (state_id, state) that is a row of D_on with weight, else 0: id and state must both match."""
+    """1 for every (state_id, state) that is a row of D_on with weight, else 0: id and state must both match, and where
+    they are given also the normalised `observations`.
+    """
     row = state_ids - batch.first_id
     inside = (row >= 0) & (row < batch.weights.shape[0])
     row = jnp.where(inside, row, 0)
     same_state = jnp.all(batch.raw_observations[row] == raw_observations, axis=-1)
+    if observations is not None:  # normalised by another program than the batch, which may round otherwise
+        same_state &= jnp.all(jnp.abs(batch.observations[row] - observations) < SAME_STATE, axis=-1)
     return (inside & same_state & (batch.weights[row] > 0)).astype(jnp.float32)
 
 
@@ -72,8 +84,9 @@ def admit(rows: Rows, batch: Batch) -> Rows:
 
 
 def admit_proposals(proposals: Proposals, batch: Batch) -> GatedProposals:
-    """Proposals with the gate of their states."""
-    return GatedProposals(proposals, provenance(proposals.state_ids, proposals.raw_observations, batch))
+    """Proposals with the gate of their states, both as the prior saw them and as the policy does."""
+    gate = provenance(proposals.state_ids, proposals.raw_observations, batch, proposals.observations)
+    return GatedProposals(proposals, gate)
 
 
 def proposal_terms(

@@ -153,7 +153,7 @@ class Guide:
             jnp.asarray(targets / float(self._rewards.std[0]), jnp.float32),
             jnp.asarray(weights),
         )
-        return rows, Batch(ids[0], rows.raw_observations, rows.weights)
+        return rows, Batch(ids[0], rows.raw_observations, rows.weights, rows.observations)
 
     def _in_environment_units(self, proposals: Proposals) -> Proposals:
         half = jnp.asarray((self.prior.action_high - self.prior.action_low) / 2)

@@ -138,6 +138,8 @@ def propose(
     if not weighted(config) and isinstance(proposer.prior, ClosedForm):
         asked = conditions(proposer.condition, actions.shape[0])
         mean, std = proposer.prior.gaussian(states.raw_observations, asked)
+    # Tagged once more: Q and the prior have chosen and weighted since, and this is how they get at the policy.
+    actions, mean, std = (checkpoint_name(x, "proposals") for x in (actions, mean, std))
     proposals = Proposals(states.state_ids, states.raw_observations, states.observations, actions, mean, std)
     metrics = {
         "q_spread": within_state_spread(values),

@@ -283,6 +283,7 @@ def _actor_step(carry, batch, settings: Settings, old_log_std, ppo: PPOConfig, a
     extra_gradient, extra_metrics = jax.lax.cond(
         settings.adds, lambda: add(actor, own, extra, settings.added_weights), lambda: zeros
     )
+    extra_gradient = jax.tree.map(lambda leaf: checkpoint_name(leaf, "added"), extra_gradient)
     gradient = jax.tree.map(jnp.add, gradient, extra_gradient)
     metrics |= extra_metrics
     metrics["actor_gradient_norm"] = tree_norm(gradient)

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from ppo_dap.nets.adapters import Adapters
@@ -103,7 +104,9 @@ class Flow(eqx.Module):
         inputs = network_inputs(observations, condition, self.observation_mean, self.observation_std)
         # Once a state for all of its actions.
         states = jnp.stack(jnp.split(self.state_net(inputs), self.config.couplings, axis=-1))
-        return self.couplings, states, jnp.asarray(kept_dimensions(self.config.couplings, self._action_size()))
+        # The tag tells the data-flow proof that this array of the program's own is no data.
+        kept = checkpoint_name(jnp.asarray(kept_dimensions(self.config.couplings, self._action_size())), "known")
+        return self.couplings, states, kept
 
     def forward(
         self, observations: Float[Array, "n obs"], condition: Float[Array, "n c"], noise: Float[Array, "n k act"]

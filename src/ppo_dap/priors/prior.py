@@ -7,6 +7,7 @@ Outside a prior actions are in the environment's units; inside they are scaled s
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -105,6 +106,14 @@ class Prior:
     def action_size(self) -> int:
         """Numbers of an action."""
         return self.action_low.shape[0]
+
+    def hash(self) -> str:
+        """Sha256 (hex) over kind, settings and network: two fits to the same logs share `logs_hash` and not this."""
+        digest = hashlib.sha256(f"{self.kind}:{dataclasses.asdict(self.config)}".encode())
+        for name, array in sorted(tree_to_tensors(self.network, "network").items()):
+            digest.update(f"{name}:{array.shape}:{array.dtype.str}:".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
     def condition(self, asked: Asked) -> Float[np.ndarray, " c"]:
         """The condition that asks for the `top` return, or for `none`.

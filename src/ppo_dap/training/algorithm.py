@@ -133,7 +133,7 @@ def _advantages(
     config: Config,
 ) -> tuple[Rows, Batch, Metrics]:
     rows = estimate_advantages(critic, parts, normaliser, reward_std, config.ppo)
-    batch = Batch(first_id, rows.raw_observations, rows.weights)
+    batch = Batch(first_id, rows.raw_observations, rows.weights, rows.observations)
     admitted = admit(rows, batch)
     return admitted, batch, {"batch_fresh": share(jnp.sum(admitted.weights), jnp.sum(rows.weights))}
 

@@ -24,13 +24,13 @@ def prove(
 ) -> list[audit.Claim]:
     """Claims of Definition 1 about the traced update of this learner; nothing is executed.
 
-    `run` is told of every stage as it is traced.
+    What an iteration hands to the next is named by the same groups as what it was given, optimizers with what they
+    move: what is proved of one iteration is then proved of all. `run` is told of every stage as it is traced.
     """
     sizes = learner.ppo.actor.mlp.layers[0].weight.shape[1], learner.ppo.actor.log_std.shape[0]
     arguments: dict[str, Any] = {
-        "actor": learner.ppo.actor,
-        "critic": learner.ppo.critic,
-        "ppo_optimizers": (learner.ppo.actor_optimizer, learner.ppo.critic_optimizer),
+        "actor": (learner.ppo.actor, learner.ppo.actor_optimizer),
+        "critic": (learner.ppo.critic, learner.ppo.critic_optimizer),
         "on_policy": (example_rollout(config, *sizes), np.float32(1)),
         "normaliser": Normaliser(np.zeros(sizes[0], np.float32), np.ones(sizes[0], np.float32)),  # type: ignore[arg-type]
         "schedule": example_schedule(stages.adds),
@@ -46,13 +46,13 @@ def prove(
             "offline": frozen.probe,
         }
 
-    def whole_update(*, actor, critic, ppo_optimizers, on_policy, normaliser, schedule, draws, previous, **guided):
+    def whole_update(*, actor, critic, on_policy, normaliser, schedule, draws, previous, **guided):
         guide = None
         if guided:
             guide = GuideState(*guided["q"], *guided["adapters"])
         rollout, reward_std = on_policy
         new, _ = iterate(
-            Learner(PPOState(actor, critic, *ppo_optimizers), guide, previous),
+            Learner(PPOState(actor[0], critic[0], actor[1], critic[1]), guide, previous),
             Frozen(*guided["backbone"], probe=guided["offline"]) if guided else None,
             rollout,
             normaliser,
@@ -63,13 +63,12 @@ def prove(
             run,
         )
         ppo, g = new.ppo, new.guide
-        rest = (ppo.actor_optimizer, ppo.critic_optimizer, g, new.previous)
-        results = {"actor": ppo.actor, "critic": ppo.critic, "rest": rest}
-        return results if g is None or g.adapters is None else results | {"adapters": g.adapters}
+        results = {"actor": (ppo.actor, ppo.actor_optimizer), "critic": (ppo.critic, ppo.critic_optimizer)}
+        results["rest"] = (ppo.actor_optimizer, ppo.critic_optimizer, g, new.previous)
+        return results if g is None or g.adapters is None else results | {"adapters": (g.adapters, g.pet_optimizer)}
 
     traced = trace(whole_update, arguments)
-    full = traced.flow(sources=("proposals",))
-    return audit.static_claims(full, traced.flow(sources=("proposals",), cuts=("theta",)))
+    return audit.static_claims(lambda cut: traced.flow(sources=("proposals",), cuts=(cut,) if cut else ()))
 
 
 def example_rollout(config: Config, observation_size: int, action_size: int) -> list[Rollout]:

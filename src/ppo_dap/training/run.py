@@ -72,23 +72,31 @@ class Run:
 
     def audit(self) -> list[audit.Claim]:
         """Definition 1, claim by claim: proved on the traced update, and measured in every iteration so far."""
-        path = self.folder / "audit.json"
-        if not path.is_file():
-            raise InputError(f"{self.folder} has no audit.json: is it a run folder?")
-        try:
-            static = [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
-        except (ValueError, LookupError, TypeError) as error:
-            raise InputError(f"{path} is damaged ({error}): it must be what `ppo-dap train` wrote") from error
+        static = audit.require_proofs(_proofs(self.folder))
         guided, config = self.config["prior_hash"] is not None, self.config["config"]
-        rows = self.metrics
-        starts = [0, *(row["env_steps"] for row in rows[:-1])]
-        in_use = sum(weights_left(start, config) > 0 for start in starts[: len(rows)])
+        evaluations = self.evaluations
+        rows = audit.every_iteration(self.metrics, evaluations[-1]["env_steps"] if evaluations else 0)
+        start, in_use = 0, 0
+        for row in rows:
+            in_use += weights_left(start, config) > 0
+            start = row.get("env_steps", start)
         return static + audit.measured_claims(rows, guided, guided and config["pet_frequency"] > 0, in_use)
 
     def verdict(self) -> tuple[bool, bool]:
         """Whether the run was strictly on-policy, and whether that is what its method's row says it is."""
         strictly = all(claim.holds for claim in self.audit())
         return strictly, strictly or not get_method(self.config["method"]).strictly_on_policy
+
+
+def _proofs(folder: Path) -> list[audit.Claim]:
+    """What was proved of the run's update, in each of the sittings in which it was made."""
+    path = folder / "audit.json"
+    if not path.is_file():
+        raise InputError(f"{folder} has no audit.json: is it a run folder?")
+    try:
+        return [audit.Claim(**claim) for claim in json.loads(path.read_text())["static"]]
+    except (ValueError, LookupError, TypeError) as error:
+        raise InputError(f"{path} is damaged ({error}): it must be what `ppo-dap train` wrote") from error
 
 
 def _read_config(folder: Path) -> dict[str, Any]:
@@ -145,6 +153,7 @@ def train(
         "preset": preset,
         "config": configs.flatten(config),
         "prior_hash": None if prior is None else prior.logs_hash,
+        "prior_weights": None if prior is None else prior.hash(),
         "logs_hash": None if logs is None else logs.hash(),
     }
     _check_folder(folder, description, resume)
@@ -172,11 +181,12 @@ def _make_trainer(
     learner = create_learner(sizes, config, None if frozen is None else frozen.prior)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
     flat = configs.flatten(config)
-    lines = None
+    lines, before = None, []
     checkpoint = folder / "checkpoints" / "last.safetensors"
     if resume and checkpoint.is_file():
         state, run = load_checkpoint(checkpoint, state)
         lines = run["lines"]
+        before = _proofs(folder)
         if frozen is not None and state.learner.guide is None and weights_left(state.env_steps, flat):
             raise InputError(f"{checkpoint} has no guide, which the run still needs: was it another config?")
     elif logs is not None:
@@ -187,6 +197,7 @@ def _make_trainer(
     alone = stages.alone()
     if stages.adds and weights_left(config.run.steps, flat) == 0:
         claims = audit.both(claims, prove(learner.alone(), None, config, alone, ahead.trace))
+    claims = audit.both(before, claims)
     if lines is None:
         write_atomically(folder / "config.json", json.dumps(description | manifest(), indent=1).encode())
     recorder = Recorder(folder, config.run.tensorboard, lines)
@@ -263,5 +274,5 @@ def _check_folder(folder: Path, description: dict[str, Any], resume: bool) -> No
                         f"cannot resume {folder} with {option} {wanted!r}: it was started with "
                         f"{stored['config'].get(option)!r}"
                     )
-        elif stored.get(name) != value:
-            raise InputError(f"cannot resume {folder} with {name} {value!r}: it was started with {stored.get(name)!r}")
+        elif stored.get(name, value) != value:  # an earlier version wrote less
+            raise InputError(f"cannot resume {folder} with {name} {value!r}: it was started with {stored[name]!r}")

@@ -37,6 +37,7 @@ from ppo_dap.training.evaluation import evaluate_policy
 from ppo_dap.training.history import History
 from ppo_dap.training.recording import Progress, Recorder
 from ppo_dap.training.state import TrainState, save_checkpoint
+from ppo_dap.training.witness import Witness
 
 LOSSES = ("ppo_loss", "value_loss", "kl_loss", "aux_loss", "awr_loss", "q_loss", "pet_loss")
 EXPLODED = 1e8
@@ -77,6 +78,7 @@ class Trainer:
     interrupted: bool = field(default=False, init=False)
     _told: bool = field(default=False, init=False)
     history: History | None = field(init=False)
+    _witness: Witness = field(init=False)
     _pending: Pending | None = field(default=None, init=False)
     _next_draws: tuple[int, Draws] | None = field(default=None, init=False)
     _recorded_steps: int = field(init=False)
@@ -86,6 +88,7 @@ class Trainer:
     def __post_init__(self):
         self.history = History(self.folder) if self.config.run.keep_history else None
         self._recorded_steps = self.state.env_steps
+        self._witness = Witness(self.state, self.spec, (self.config.run.seed, ROLLOUT_STREAM))
 
     def run(self) -> None:
         """Train until the budget is spent, or until a checkpoint after Ctrl-C, which holds the end either way."""
@@ -113,7 +116,7 @@ class Trainer:
         self._segment_start = state.iteration
         seed = _seed(config.seed, ENV_STREAM, state.iteration)
         state.reward_scale = state.reward_scale.restart()
-        env = make_vector_env(self.spec.task, self.config.ppo.num_envs, seed, config.threads)
+        env = self._witness.watch(make_vector_env(self.spec.task, self.config.ppo.num_envs, seed, config.threads))
         try:
             collector = Collector(env)
             while True:
@@ -141,6 +144,7 @@ class Trainer:
     def iterate(self, collector: Collector) -> None:
         """One iteration of Algorithm 1. Returns when the actor is there; the last iteration's metrics are recorded."""
         state, config, start = self.state, self.config, time.perf_counter()
+        self._witness.before(state)
         if self.stages.adds and not self._weights_left():
             self._go_on_alone()
         parts: list[Rollout] = []
@@ -161,6 +165,7 @@ class Trainer:
             valid = np.concatenate([part.valid for part in parts])
             state.observations = state.observations.update(np.concatenate([p.observations for p in parts])[valid])
             row: dict[str, Any] = {"env_steps": state.env_steps + int(valid.sum()), "iteration": state.iteration + 1}
+            row["witnessed"] = self._witness.after(state, parts)
             row["return_train"] = float(np.mean(r)) if (r := collector.finished_returns) else None
             collector.finished_returns = []
             self._next_draws = state.iteration + 1, self._draws(state.iteration + 1)
@@ -267,6 +272,7 @@ class Trainer:
             return
         (row, metrics, seconds, total), self._pending = self._pending, None
         metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        metrics["batch_fresh"] *= row["witnessed"]
         for name in LOSSES:
             if name in metrics and not abs(metrics[name]) < EXPLODED:
                 raise TrainingDiverged(f"iteration {row['iteration'] - 1}: {name} is {metrics[name]:g}; {self._kept()}")

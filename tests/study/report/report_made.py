@@ -16,7 +16,10 @@ SPLIT = {
 }  # fmt: skip
 """Seconds of an iteration of one second."""
 GOOD = {"batch_fresh": 1.0, "ratio_error": 1e-6, "spr": 1.0, "pet_spr": 1.0, "oglr": 0.0}
-STATIC = {"clause": "(i)", "statement": "the advantages are made of V and D_on", "holds": True, "evidence": "proved"}
+STATIC = [
+    {"clause": "(i)", "statement": "the advantages are made of V and D_on", "holds": True, "evidence": "proved"},
+    {"clause": "(iv)", "statement": "no array of D_off reaches the new policy", "holds": True, "evidence": "proved"},
+]
 
 
 def evaluations(height, seed, steps=STEPS):
@@ -43,10 +46,11 @@ def make_run(folder, method="ppo", seed=0, height=500.0, *, task="Hopper-v5", st
     description |= {"logs_hash": None, "versions": {"jax": "0.10.2"}, "python": "3.11.7", "NPROC": "1"}
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(description))
-    (folder / "audit.json").write_text(json.dumps({"static": [STATIC]}))
+    (folder / "audit.json").write_text(json.dumps({"static": STATIC}))
     rows = [row for row in evaluations(height, seed, steps) if ends == steps or row["env_steps"] <= ends]
     (folder / "evaluations.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     seconds = {f"seconds_{name}": value for name, value in SPLIT.items()} | {"seconds_iteration": 1.0}
+    ends = max(ends, rows[-1]["env_steps"])
     lines = [GOOD | seconds | measured | {"env_steps": ends * n // 4, "iteration": n} for n in range(1, 5)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return folder
