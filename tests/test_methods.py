@@ -207,9 +207,17 @@ def test_a_method_changes_what_it_fixes_and_nothing_else(name, preset):
     method, config = get_method(name), make(preset)
     before, after = flatten(config), flatten(resolve(method, config, {}))
     changes = limits(method)
-    assert {n for n in before if before[n] != after[n]} <= {*changes, *method.defaults}
+    of_a_prior = {"initial_std"} if method.prior == "none" and before["initial_std"] is None else set()
+    assert {n for n in before if before[n] != after[n]} <= {*changes, *method.defaults, *of_a_prior}
     for field, value in changes.items():
         assert after[field] in (value if isinstance(value, tuple) else (value,))
+
+
+def test_a_policy_starts_at_the_priors_spread_where_there_is_a_prior():
+    for method, std in (("ppo", 1.0), ("ppo-awr", 1.0), ("ppo-dap", None), ("ppo-vae", None)):
+        assert resolve(get_method(method), replace(Config(), initial_std=None), {}).ppo.initial_std == std
+    with pytest.raises(InputError, match="initial_std None is the prior's, and method ppo-gc has none: give a number"):
+        resolve(get_method("ppo-gc"), make(initial_std=None), {"initial_std": None})
 
 
 def test_a_preset_gives_way_to_the_method():

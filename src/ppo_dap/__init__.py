@@ -6,7 +6,6 @@ The names below are the whole public interface; each is imported when it is firs
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -41,7 +40,9 @@ __all__ = sorted(_SOURCES)
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return importlib.metadata.version("ppo-dap")
+        from importlib.metadata import version  # ten times what the rest of this file costs
+
+        return version("ppo-dap")
     if name not in _SOURCES:
         raise AttributeError(f"module 'ppo_dap' has no attribute {name!r}")
     module, attribute = _SOURCES[name]

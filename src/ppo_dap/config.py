@@ -49,6 +49,10 @@ class PPOConfig:
     """Policy-KL monitoring target (Table 2)."""
     hidden_size: int = 64
     """Width of the two tanh layers of actor and critic."""
+    initial_std: float | None = 1.0
+    """Standard deviation that the policy starts with, in scaled actions; None: the prior's own (`Prior.spread`), from
+    `warm_start_std_floor` to 1, so that fresh states are those that the prior knows. A warm start of the actor sets it
+    anew."""
     observation_clip: float = 10.0
     """Normalised observations are clipped to this many standard deviations."""
     reward_clip: float = 10.0
@@ -188,7 +192,8 @@ class WarmStartConfig:
     warm_start_epochs: int = 20
     """Most passes over the logs; early stopping on held-out episodes ends it sooner."""
     warm_start_std_floor: float = 0.2
-    """Smallest standard deviation of the cloned policy, in scaled actions, so that PPO can still explore."""
+    """Smallest standard deviation that logs or a prior start the policy with, in scaled actions, so that PPO can still
+    explore."""
     q_warm_start: bool = False
     """With `warm_start = actor`, start Q as well, by regression on logged returns-to-go; `actor_critic` always does."""
     logs_filter: float = 1.0
@@ -303,7 +308,7 @@ _RULES: dict[str, Rule] = {
     "clip_slope": (lambda v: -1 <= v <= 1, "a number from -1 to 1"),
     "reuse_batches": (lambda v: 0 <= v <= 1, "a number from 0 to 1"),
     **dict.fromkeys(
-        ("displacement_cap", "top_k", "keep_diverse", "boundary_kl", "lambda_decay_steps"),
+        ("displacement_cap", "top_k", "keep_diverse", "boundary_kl", "lambda_decay_steps", "initial_std"),
         (lambda v: v is None or v > 0, "a number above 0, or None"),
     ),
     "lambda_decay": (lambda v: v is None or 0 < v <= 1, "a number above 0 and at most 1, or None"),

@@ -131,6 +131,10 @@ def resolve(method: Method, config: Config, given: Mapping[str, Any], kind: str 
         current = flatten(config)[name]
         chosen[name] = current if current in allowed else allowed[0]
     config = replace(config, **chosen)
+    if method.prior == "none" and config.ppo.initial_std is None:
+        if "initial_std" in given:
+            raise InputError(f"initial_std None is the prior's, and method {method.name} has none: give a number")
+        config = replace(config, initial_std=1.0)
     for name in given:
         _require_effect(name, given[name], method, flatten(config))
     return config

@@ -50,6 +50,19 @@ def test_clone_is_the_gaussian_with_the_moments_of_the_logs(fitted):
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=0.1)
 
 
+def test_spread_is_that_of_the_gaussians(fitted):
+    prior = fitted("behaviour")
+    states = jnp.asarray(prior.probe_observations, jnp.float32)
+    mean, std = (np.asarray(x) for x in prior.network.gaussian(states, jnp.zeros((len(states), 0))))
+    # A normal variable that is cut off where the task's actions end, as what is executed is.
+    cut = stats.norm(mean, std)
+    low, high = cut.cdf(-1), cut.sf(1)
+    inside = stats.truncnorm((-1 - mean) / std, (1 - mean) / std, mean, std)
+    first = inside.mean() * (1 - low - high) + high - low
+    second = inside.moment(2) * (1 - low - high) + high + low
+    np.testing.assert_allclose(prior.spread(), np.sqrt((second - first**2).mean(axis=0)), rtol=0.03)
+
+
 def test_clone_cannot_keep_two_modes(fitted):
     truth = TwoModes()
     actual = truth.sample(STATES, 1000, np.random.default_rng(5))

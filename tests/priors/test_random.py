@@ -32,6 +32,11 @@ def test_actions_are_uniform_in_the_box_whatever_the_state(control):
     np.testing.assert_array_equal(actions, np.asarray(again, np.float64))
 
 
+def test_its_spread_is_a_uniform_variables(control):
+    """The third dimension has no range, and so no spread."""
+    np.testing.assert_allclose(control.spread(), [1 / np.sqrt(3), 1 / np.sqrt(3), 0], rtol=0.02)
+
+
 def test_the_test_of_uniformity_finds_what_is_not(control):
     """The planted fault: normal actions clipped to the box."""
     noise = np.clip(jax.random.normal(jax.random.key(0), (4000,)), -1, 1) * 2

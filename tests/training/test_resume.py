@@ -128,6 +128,18 @@ def test_another_config_cannot_resume_a_run(uninterrupted, hopper_prior, small):
         ppo_dap.train("Hopper-v5", prior=hopper_prior, out=uninterrupted, steps=1500, resume=True, gamma=0.9, **small)
 
 
+def test_a_run_of_a_version_that_knew_fewer_options_goes_on(tmp_path, uninterrupted, hopper_prior, small):
+    """What it did not know was as it is by default."""
+    out = shutil.copytree(uninterrupted, tmp_path / "run")
+    config = json.loads((out / "config.json").read_text())
+    del config["config"]["initial_std"]
+    (out / "config.json").write_text(json.dumps(config))
+    options = {"prior": hopper_prior, "out": out, "steps": 1500, "resume": True, "progress": False} | small
+    assert ppo_dap.train("Hopper-v5", **options).finished
+    with pytest.raises(ppo_dap.InputError, match=r"initial_std 0\.5: it was started with 1\.0"):
+        ppo_dap.train("Hopper-v5", **options, initial_std=0.5)
+
+
 def test_a_run_is_never_written_over(uninterrupted, hopper_prior, small):
     before = {p: p.read_bytes() for p in uninterrupted.rglob("*") if p.is_file()}
     with pytest.raises(ppo_dap.InputError, match="holds a run already"):

@@ -129,3 +129,21 @@ def test_q_and_the_best_episodes_need_rewards_and_q_needs_a_warm_start():
         warm_start(start(config), logs, SPEC, config)
     with pytest.raises(InputError, match="q_warm_start needs a warm_start: 'actor', or 'actor_critic'"):
         configs.make(q_warm_start=True)
+
+
+@pytest.mark.parametrize(("spread", "std"), [(0.4, 0.4), (0.05, 0.2), (1.7, 1.0)])
+def test_the_policys_spread_starts_at_the_priors_within_bounds(spread, std):
+    config = configs.make(initial_std=None)
+    learners = [create_learner((2, 1), c, None, np.array([spread])) for c in (config, configs.make())]
+    stds = [float(np.exp(learner.ppo.actor.log_std[0])) for learner in learners]
+    assert stds == pytest.approx([std, 1.0])
+    assert bits(learners[0].ppo.actor.mlp) == bits(learners[1].ppo.actor.mlp)
+
+
+def test_a_run_asks_its_prior_for_the_spread(tmp_path, hopper_prior, small):
+    """At a learning rate that moves nothing."""
+    options = {"prior": hopper_prior, "steps": 256, "learning_rate": 1e-9, "progress": False} | small
+    run = ppo_dap.train("Hopper-v5", out=tmp_path / "run", initial_std=None, **options)
+    started = np.clip(ppo_dap.load_prior(hopper_prior).spread(), 0.2, 1)
+    np.testing.assert_allclose(np.exp(run.policy.log_std), started, rtol=1e-4)
+    assert all(claim.holds for claim in run.audit())

@@ -81,7 +81,7 @@ class Prior:
     training: dict[str, Any]
     """Summary of the fit: steps, losses, rows, seconds."""
     probe_observations: Float[np.ndarray, "probe obs"]
-    """Observations of a few rows of the logs, for the leakage audit alone (Eq. 11 needs an offline minibatch)."""
+    """Observations of a few rows of the logs, for the leakage audit (Eq. 11 needs an offline minibatch) and `spread`."""
     probe_actions: Float[np.ndarray, "probe act"]
     """Scaled actions of the same rows."""
     asks: dict[str, float] = field(default_factory=dict)
@@ -151,6 +151,15 @@ class Prior:
         inputs = jnp.asarray(observations, jnp.float32), jnp.asarray(self.condition(asked))
         scaled = _sample(self.network, *inputs, noise, solver)
         return unscale_actions(scaled, self.action_low, self.action_high)
+
+    def spread(self, asked: Asked = "none") -> Float[np.ndarray, " act"]:
+        """Standard deviation of the prior's actions at a state, scaled: root mean square over its probe states.
+
+        Estimated from 16 actions a state, always with the same noise.
+        """
+        samples = np.asarray(self.sample(self.probe_observations, jax.random.key(0), 16, asked))
+        scaled = scale_actions(samples, self.action_low, self.action_high)
+        return np.sqrt(scaled.var(axis=1, ddof=1).mean(axis=0))
 
     def save(self, path: str | Path) -> None:
         """Write the prior to exactly `path`; raises `InputError` where that would cost another file its content."""

@@ -80,10 +80,21 @@ class Schedule(NamedTuple):
     pet_steps: Int[Array, ""]
 
 
-def create_learner(sizes: tuple[int, int], config: Config, prior: Network | None) -> Learner:
-    """Fresh networks by the config's seed; the guide's come after PPO's, whose start does not depend on them."""
+def create_learner(
+    sizes: tuple[int, int],
+    config: Config,
+    prior: Network | None,
+    prior_spread: Float[np.ndarray, " act"] | None = None,
+) -> Learner:
+    """Fresh networks by the config's seed; the guide's come after PPO's, whose weights do not depend on them.
+
+    `prior_spread` is what the policy's standard deviation starts at where `initial_std` is None.
+    """
     rng = np.random.default_rng([config.run.seed, NETWORK_STREAM])
-    ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size)
+    std = config.ppo.initial_std
+    if std is None:
+        std = 1.0 if prior_spread is None else np.clip(prior_spread, config.warm.warm_start_std_floor, 1.0)
+    ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size, std)
     previous = no_batch(config.ppo, *sizes) if config.ppo.reuse_batches else None
     if prior is None:
         return Learner(ppo, None, previous)

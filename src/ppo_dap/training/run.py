@@ -178,7 +178,10 @@ def _make_trainer(
     if prior is not None:
         probe = audit.Probe(on_device(prior.probe_observations), on_device(prior.probe_actions))
         frozen = Frozen(prior.network, on_device(condition), probe)
-    learner = create_learner(sizes, config, None if frozen is None else frozen.prior)
+    spread = None
+    if prior is not None and config.ppo.initial_std is None:
+        spread = prior.spread(config.proposals.prior_return)
+    learner = create_learner(sizes, config, None if frozen is None else frozen.prior, spread)
     state = TrainState(learner, RunningMoments.create(sizes[0]), RewardScale.create(config.ppo.num_envs))
     flat = configs.flatten(config)
     lines, before = None, []
@@ -265,14 +268,12 @@ def _check_folder(folder: Path, description: dict[str, Any], resume: bool) -> No
         return
     if not resume:
         raise InputError(f"out {folder} holds a run already: name a new folder, or resume it")
-    stored = _read_config(folder)
+    stored, defaults = _read_config(folder), configs.flatten(Config())
     for name, value in description.items():
         if name == "config":
             for option, wanted in value.items():
-                if stored["config"].get(option) != wanted:
-                    raise InputError(
-                        f"cannot resume {folder} with {option} {wanted!r}: it was started with "
-                        f"{stored['config'].get(option)!r}"
-                    )
+                started = stored["config"].get(option, defaults[option])  # an earlier version knew fewer options
+                if started != wanted:
+                    raise InputError(f"cannot resume {folder} with {option} {wanted!r}: it was started with {started!r}")
         elif stored.get(name, value) != value:  # an earlier version wrote less
             raise InputError(f"cannot resume {folder} with {name} {value!r}: it was started with {stored[name]!r}")
