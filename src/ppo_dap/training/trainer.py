@@ -201,7 +201,7 @@ class Trainer:
     def _calibrated(self, learner: Learner) -> Learner:
         if learner.guide is None:
             return learner
-        return Learner(learner.ppo, recalibrated(learner.guide, self.config.q))
+        return Learner(learner.ppo, recalibrated(learner.guide, self.config.q), learner.previous)
 
     def _collect(self, collector: Collector, parts: list[Rollout]) -> Iterator[Rollout]:
         """The rollout, part by part; `parts` keeps them."""
