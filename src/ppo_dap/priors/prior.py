@@ -81,7 +81,7 @@ class Prior:
     training: dict[str, Any]
     """Summary of the fit: steps, losses, rows, seconds."""
     probe_observations: Float[np.ndarray, "probe obs"]
-    """Observations of a few rows of the logs, for the leakage audit (Eq. 11 needs an offline minibatch) and `spread`."""
+    """Observations of a few rows of the logs, for `spread` and the leakage audit (Eq. 11's offline minibatch)."""
     probe_actions: Float[np.ndarray, "probe act"]
     """Scaled actions of the same rows."""
     asks: dict[str, float] = field(default_factory=dict)

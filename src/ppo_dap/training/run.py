@@ -273,7 +273,11 @@ def _check_folder(folder: Path, description: dict[str, Any], resume: bool) -> No
         if name == "config":
             for option, wanted in value.items():
                 started = stored["config"].get(option, defaults[option])  # an earlier version knew fewer options
-                if started != wanted:
-                    raise InputError(f"cannot resume {folder} with {option} {wanted!r}: it was started with {started!r}")
-        elif stored.get(name, value) != value:  # an earlier version wrote less
-            raise InputError(f"cannot resume {folder} with {name} {value!r}: it was started with {stored[name]!r}")
+                _require_same(folder, option, wanted, started)
+        else:
+            _require_same(folder, name, value, stored.get(name, value))  # nor did it write as much
+
+
+def _require_same(folder: Path, name: str, wanted: Any, started: Any) -> None:
+    if started != wanted:
+        raise InputError(f"cannot resume {folder} with {name} {wanted!r}: it was started with {started!r}")

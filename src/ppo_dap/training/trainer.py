@@ -5,11 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import signal
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +32,7 @@ from ppo_dap.training.cores import pinned
 from ppo_dap.training.draws import Draws, draw, num_parts
 from ppo_dap.training.evaluation import evaluate_policy
 from ppo_dap.training.history import History
+from ppo_dap.training.interrupt import Interrupt
 from ppo_dap.training.recording import Progress, Recorder
 from ppo_dap.training.state import TrainState, save_checkpoint
 from ppo_dap.training.witness import Witness
@@ -75,8 +73,7 @@ class Trainer:
     before_first: Callable[[], None] = lambda: None
     """Called before the first iteration: waits until the stages are compiled."""
     clock: Clock = field(default_factory=Clock, init=False)
-    interrupted: bool = field(default=False, init=False)
-    _told: bool = field(default=False, init=False)
+    _interrupt: Interrupt = field(default_factory=Interrupt, init=False)
     history: History | None = field(init=False)
     _witness: Witness = field(init=False)
     _pending: Pending | None = field(default=None, init=False)
@@ -94,11 +91,11 @@ class Trainer:
         """Train until the budget is spent, or until a checkpoint after Ctrl-C, which holds the end either way."""
         self._write_audit()
         try:
-            with self._deferred_interrupt(), pinned(self.config.run.pin_core and self.config.run.threads == 1):
+            with self._interrupt.deferred(), pinned(self.config.run.pin_core and self.config.run.threads == 1):
                 if self.state.iteration == 0:
                     self.evaluate()
                 self.before_first()
-                while self.state.env_steps < self.config.run.steps and not self.interrupted:
+                while self.state.env_steps < self.config.run.steps and not self._interrupt.asked:
                     self._segment()
                     self.checkpoint("last")
             self._policy().save(self.folder / "policy.safetensors")
@@ -128,18 +125,9 @@ class Trainer:
                 left = -state.iteration % config.checkpoint_every
                 if state.env_steps >= config.steps or not left:
                     break
-                self._tell_of_interrupt(left)
+                self._interrupt.tell(self.folder, left)
         finally:
             env.close()
-
-    def _tell_of_interrupt(self, left: int) -> None:
-        """Say, once, how long it takes: a checkpoint before its time would have the resumed run restart environments
-        where no other run does.
-        """
-        if self.interrupted and not self._told:
-            text = f"stopping at the next checkpoint, after {left} more iterations; Ctrl-C again stops at once"
-            print(f"{self.folder}: {text}", file=sys.stderr, flush=True)
-            self._told = True
 
     def iterate(self, collector: Collector) -> None:
         """One iteration of Algorithm 1. Returns when the actor is there; the last iteration's metrics are recorded."""
@@ -322,24 +310,6 @@ class Trainer:
         """What was proved about the update; what is measured is in the metrics."""
         claims = [dataclasses.asdict(claim) for claim in self.static_claims]
         write_atomically(self.folder / "audit.json", json.dumps({"static": claims}, indent=1).encode())
-
-    @contextmanager
-    def _deferred_interrupt(self) -> Iterator[None]:
-        """Ctrl-C ends the run at its next checkpoint; a second one ends it at once."""
-
-        def note(signum, frame):
-            self.interrupted = True
-            signal.signal(signal.SIGINT, previous)
-
-        try:
-            previous = signal.signal(signal.SIGINT, note)
-        except ValueError:  # not the main thread: whoever runs us handles signals
-            yield
-            return
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, previous)
 
 
 def _array(value: Any, dtype: Any = np.float32) -> Any:
