@@ -66,9 +66,9 @@ def test_a_run_that_reuses_a_batch_says_so_and_resumes_with_the_same_bits(tmp_pa
     assert fresh[1:] == pytest.approx([0.5] * 4, abs=0.02)
     assert whole.verdict() == (False, True)  # not strictly on-policy, as its row of the table says
     broken = [claim for claim in whole.audit() if not claim.holds]
-    assert [claim.clause for claim in broken] == ["(i)"] * 3
-    assert [claim.evidence for claim in broken[:2]] == ["reached by previous"] * 2
-    assert "current batch" in broken[2].statement
+    assert [claim.clause for claim in broken] == ["(i)"] * 4
+    assert [claim.evidence for claim in broken[:3]] == ["reached by previous"] * 3
+    assert "current batch" in broken[3].statement
 
     def full(path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
