@@ -44,6 +44,13 @@ def measured(learner, frozen, stages, fault=None, iterations=(0,), rollout=rollo
     return rows
 
 
+def again(stages, name):
+    """`stages` with the one of that name traced anew: what was patched since is in it."""
+    leaking = copy.copy(stages)
+    setattr(leaking, name, getattr(Stages(small_config(), guided=True), name))
+    return leaking
+
+
 def test_without_a_fault_every_measured_claim_holds(learner, frozen, stages):
     metrics = measured(learner, frozen, stages, iterations=(0, 1, 5))
     claims = audit.measured_claims(metrics)
@@ -72,9 +79,7 @@ def test_pgshare_is_ppos_gradient_over_the_actors(learner, frozen, stages, confi
 
 def test_an_open_gate_shows_in_oglr(learner, frozen, stages, monkeypatch):
     monkeypatch.setattr(objective, "provenance", lambda ids, *_: jnp.ones(len(ids)))
-    open_stages = copy.copy(stages)
-    open_stages.leakage = Stages(small_config(), guided=True).leakage
-    (row,) = measured(learner, frozen, open_stages)
+    (row,) = measured(learner, frozen, again(stages, "leakage"))
     assert violated(audit.measured_claims([row])) == {OGLR}
     assert row["oglr"] == pytest.approx(row["oglr_ungated"], rel=1e-5)
 
@@ -116,9 +121,7 @@ def test_proposals_for_states_outside_d_on_are_found(learner, frozen, stages, mo
         return real(ids if keep_id else ids.at[:half].set(-1), raw, observations, features)
 
     monkeypatch.setattr(guide, "States", half_logged)
-    leaking = copy.copy(stages)
-    leaking.propose = Stages(small_config(), guided=True).propose
-    rows = measured(learner, frozen, leaking)
+    rows = measured(learner, frozen, again(stages, "propose"))
     assert violated(audit.measured_claims(rows)) == {SPR}
     assert rows[0]["spr"] == 0.5
 
@@ -131,9 +134,7 @@ def test_proposals_that_the_policy_imitates_on_other_states_are_found(learner, f
         return real(ids, raw, jnp.roll(observations, 1, axis=0), features)
 
     monkeypatch.setattr(guide, "States", shifted)
-    leaking = copy.copy(stages)
-    leaking.propose = Stages(small_config(), guided=True).propose
-    rows = measured(learner, frozen, leaking)
+    rows = measured(learner, frozen, again(stages, "propose"))
     assert violated(audit.measured_claims(rows)) == {SPR}
     assert rows[0]["spr"] == 0
 

@@ -21,17 +21,10 @@ class Actor(eqx.Module):
     log_std: Float[Array, " act"]
 
     @staticmethod
-    def create(
-        rng: np.random.Generator,
-        observation_size: int,
-        action_size: int,
-        hidden_size: int,
-        std: float | Float[np.ndarray, " act"] = 1.0,
-    ) -> Actor:
-        """Orthogonal start, gain 0.01 on the mean head."""
+    def create(rng: np.random.Generator, observation_size: int, action_size: int, hidden_size: int) -> Actor:
+        """Orthogonal start, gain 0.01 on the mean head, standard deviation 1."""
         sizes = (observation_size, hidden_size, hidden_size, action_size)
-        log_std = np.log(np.broadcast_to(std, action_size))
-        return Actor(MLP.create(rng, sizes, "tanh", final_gain=0.01), on_device(log_std))
+        return Actor(MLP.create(rng, sizes, "tanh", final_gain=0.01), on_device(np.zeros(action_size)))
 
     def __call__(self, observations: Float[Array, "n obs"]) -> Float[Array, "n act"]:
         """Means at normalised observations."""

@@ -48,15 +48,9 @@ class PPOState(eqx.Module):
     critic_optimizer: optax.OptState
 
     @staticmethod
-    def create(
-        rng: np.random.Generator,
-        observation_size: int,
-        action_size: int,
-        hidden_size: int,
-        std: float | Float[np.ndarray, " act"] = 1.0,
-    ) -> PPOState:
-        """Fresh networks; `std` is the policy's standard deviation."""
-        actor = Actor.create(rng, observation_size, action_size, hidden_size, std)
+    def create(rng: np.random.Generator, observation_size: int, action_size: int, hidden_size: int) -> PPOState:
+        """Fresh networks."""
+        actor = Actor.create(rng, observation_size, action_size, hidden_size)
         critic = Critic.create(rng, observation_size, hidden_size)
         return PPOState(actor, critic, first_state(ADAM, actor), first_state(ADAM, critic))
 

@@ -28,6 +28,7 @@ from ppo_dap.dap.guide import (
 )
 from ppo_dap.dap.objective import Batch, added_gradient, admit, provenance
 from ppo_dap.dap.proposals import ProposalDraws, Proposer
+from ppo_dap.nets.arrays import on_device
 from ppo_dap.nets.critic import Critic
 from ppo_dap.ppo.reuse import Candidate, contest, no_batch, previous_rows, remember
 from ppo_dap.ppo.rollout import Rollout
@@ -88,13 +89,15 @@ def create_learner(
 ) -> Learner:
     """Fresh networks by the config's seed; the guide's come after PPO's, whose weights do not depend on them.
 
-    `prior_spread` is what the policy's standard deviation starts at where `initial_std` is None.
+    `prior_spread` is what the policy's standard deviation starts at where `initial_std` is None; it may be left out
+    where a checkpoint takes the policy's place.
     """
     rng = np.random.default_rng([config.run.seed, NETWORK_STREAM])
     std = config.ppo.initial_std
     if std is None:
         std = 1.0 if prior_spread is None else np.clip(prior_spread, config.warm.warm_start_std_floor, 1.0)
-    ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size, std)
+    ppo = PPOState.create(rng, *sizes, config.ppo.hidden_size)
+    ppo = eqx.tree_at(lambda p: p.actor.log_std, ppo, on_device(np.log(np.broadcast_to(std, sizes[1]))))
     previous = no_batch(config.ppo, *sizes) if config.ppo.reuse_batches else None
     if prior is None:
         return Learner(ppo, None, previous)
