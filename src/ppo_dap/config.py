@@ -244,8 +244,8 @@ class Config:
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "tuned": {
-        "lambda_kl": 0.1, "lambda_aux": 0.3, "lambda_decay": 0.5, "lambda_decay_steps": 100_000, "kl_rule": "monitor",
-        "mode_seeking": 1.0,
+        "initial_std": None, "std_floor": 0.3, "lambda_kl": 3.0, "lambda_aux": 0.1, "lambda_decay": 0.5,
+        "lambda_decay_steps": 100_000, "kl_rule": "monitor", "mode_seeking": 1.0, "guidance_gate": True,
     },
     "tuned-warm": {
         "lambda_kl": 0.2, "lambda_aux": 0.0, "lambda_decay": 0.5, "kl_rule": "monitor",

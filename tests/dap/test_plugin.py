@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import ppo_dap
-from ppo_dap.config import make
+from ppo_dap.config import flatten, make, replace
 from ppo_dap.errors import InputError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "guide_in_another_ppo.py"
@@ -219,9 +219,10 @@ def test_it_takes_a_prior_by_its_file(prior, batch, tmp_path):
 def test_of_a_preset_it_has_all_but_what_needs_the_policy(prior, batch):
     guide = guide_of(prior, preset="tuned")
     tuned = make("tuned")
-    assert tuned.proposals.mode_seeking > 0
-    assert guide.config.proposals.mode_seeking == 0
-    assert guide.config.objective == tuned.objective
+    left_out = {"mode_seeking": 0.0, "guidance_gate": False, "std_floor": 0.0}
+    of_preset, of_guide = flatten(tuned), flatten(guide.config)
+    assert all(of_preset[name] != off == of_guide[name] for name, off in left_out.items())
+    assert guide.config.objective == replace(tuned, std_floor=0.0).objective
     assert np.isfinite(guide(**batch).actions).all()
 
 

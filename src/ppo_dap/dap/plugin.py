@@ -54,8 +54,9 @@ class Guide:
         """`prior`, or its file; `total_iterations` of the run, for the annealing of beta; `options` are fields of
         `Config` by name.
 
-        Q has a trunk of its own here, since this PPO's value network is not ours to read, and a preset's `mode_seeking`
-        is left out, since the policy is not either.
+        Q has a trunk of its own here, since this PPO's value network is not ours to read. What a preset has of the
+        policy is left out, since that is not ours either: `mode_seeking`, `guidance_gate`, `std_floor`, and
+        `initial_std`, for which `prior.spread()` has the number.
         """
         if not isinstance(total_iterations, int) or total_iterations < 1:
             raise InputError(f"total_iterations must be a whole number above 0, not {total_iterations!r}")
