@@ -16,6 +16,8 @@ DAMAGED = (
     ("run-audit-bare", "audit.json", "{}"),
     ("run-rowless", "evaluations.jsonl", ""),
     ("run-list", "evaluations.jsonl", "[1, 2]\n"),
+    ("run-part", "config.json", '{"task": "Pendulum-v1", "method": "ppo", "preset": "paper", "config": {"steps": 1}}'),
+    ("run-seedless", "config.json", '{"task": "a", "method": "ppo", "preset": "b", "prior_hash": null, "config": {}}'),
 )
 """Runs of which one file is not what it was: (name, file, what is in it)."""
 TASK = "Pendulum-v1"  # 3 observations, 1 action in [-2, 2], no EnvPool to wait for

@@ -185,6 +185,8 @@ BAD = {
     "audit without claims": ("audit @run-audit-bare", "audit.json is damaged ('static')"),
     "evaluate without evaluations": ("evaluate @run-rowless", "run-rowless has no row in evaluations.jsonl"),
     "evaluate of lists": ("evaluate @run-list", "evaluations.jsonl is damaged", "line 1 is [1, 2]", "must be"),
+    "summary of a part": ("summary @run-part", "config.json is damaged (it lacks prior_hash)", "must be what"),
+    "summary without settings": ("summary @run-seedless", "config.json is damaged (it lacks seed, steps)"),
     "audit of no audit": ("audit @run", "has no audit.json"),
     "evaluate without policy": ("evaluate @run-policyless", "no policy file at", "--resume"),
     "evaluate newer": ("evaluate @run-newer", "policy format 99", "reads up to", "update ppo-dap"),

@@ -29,8 +29,8 @@ def store(tmp_path):
     done, open_ = (cells.run("Pendulum-v1", "ppo", seed=seed, steps=8000) for seed in (0, 1))
     out = store.out(done)
     out.mkdir(parents=True)
-    config = {"task": "Pendulum-v1", "method": "ppo", "prior_hash": None, "config": {"pet_frequency": 0, "steps": 8000}}
-    config["processor"] = "A processor"
+    config = {"task": "Pendulum-v1", "method": "ppo", "preset": "paper", "prior_hash": None, "processor": "A processor"}
+    config["config"] = {"pet_frequency": 0, "steps": 8000, "seed": 0}
     (out / "config.json").write_text(json.dumps(config))
     (out / "audit.json").write_text(json.dumps({"static": []}))
     rows = [

@@ -43,7 +43,7 @@ class Run:
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """`config.json`: the resolved settings and the manifest."""
+        """`config.json`: the resolved settings, at their defaults what its version did not know; the manifest."""
         return _read_config(self.folder)
 
     @cached_property
@@ -103,9 +103,11 @@ def _read_config(folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
     try:
         stored = json.loads(path.read_text())
-        if not {"task", "method", "config"} <= stored.keys():
-            raise ValueError("it lacks task, method or config")
-        return stored
+        lacking = {"task", "method", "preset", "prior_hash", "config"} - stored.keys()
+        lacking = lacking or {"seed", "steps"} - stored["config"].keys()
+        if lacking:
+            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+        return stored | {"config": configs.flatten(Config()) | stored["config"]}
     except (ValueError, AttributeError) as error:
         raise InputError(f"{path} is damaged ({error}): it must be what `ppo-dap train` wrote") from error
 
@@ -268,14 +270,13 @@ def _check_folder(folder: Path, description: dict[str, Any], resume: bool) -> No
         return
     if not resume:
         raise InputError(f"out {folder} holds a run already: name a new folder, or resume it")
-    stored, defaults = _read_config(folder), configs.flatten(Config())
+    stored = _read_config(folder)
     for name, value in description.items():
         if name == "config":
             for option, wanted in value.items():
-                started = stored["config"].get(option, defaults[option])  # an earlier version knew fewer options
-                _require_same(folder, option, wanted, started)
+                _require_same(folder, option, wanted, stored["config"][option])
         else:
-            _require_same(folder, name, value, stored.get(name, value))  # nor did it write as much
+            _require_same(folder, name, value, stored.get(name, value))  # an earlier version wrote less
 
 
 def _require_same(folder: Path, name: str, wanted: Any, started: Any) -> None:

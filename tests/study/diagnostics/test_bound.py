@@ -158,7 +158,8 @@ def rng():
 
 def write_run(folder, rows, evaluations, method="ppo-dap", reward_std=2.0):
     folder.mkdir()
-    config = {"task": "Toy-v0", "method": method, "prior_hash": None, "config": {"gamma": 0.9}}
+    config = {"task": "Toy-v0", "method": method, "preset": "paper", "prior_hash": None}
+    config["config"] = {"gamma": 0.9, "seed": 0, "steps": 1}
     (folder / "config.json").write_text(json.dumps(config))
     for name, table in (("metrics", rows), ("evaluations", evaluations)):
         (folder / f"{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in table))

@@ -128,7 +128,7 @@ def test_damaged_and_unfinished_runs_are_named(tmp_path, folders):
     for folder, reason in zip(
         bad,
         (
-            "has no audit.json", "statement", "is damaged", "unknown method", "it lacks '",
+            "has no audit.json", "statement", "is damaged", "unknown method", "it lacks prior_hash",
             "line 2 of its metrics.jsonl is damaged", "line 1 of its evaluations.jsonl", "decode", "no config.json",
         ),
         strict=True,
