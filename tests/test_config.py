@@ -163,7 +163,15 @@ def test_at_most_one_batch_is_reused():
 
 
 AT_LEAST_0 = {"value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "pet_frequency", "eval_every"}
-AT_LEAST_0 |= {"q_pessimism", "mode_seeking", "prior_return_weight", "lambda_awr", "contest_kl_weight", "std_floor"}
+AT_LEAST_0 |= {
+    "q_pessimism",
+    "mode_seeking",
+    "prior_return_weight",
+    "lambda_awr",
+    "contest_kl_weight",
+    "std_floor",
+    "std_after",
+}
 
 
 @pytest.mark.parametrize("name", NUMBERS)

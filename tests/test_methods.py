@@ -170,6 +170,7 @@ def test_options_that_contradict_the_method_are_refused(method, option, value, r
         ("ppo-gc", "boundary_kl", 0.01, "it needs surrogate 'authentic_boundary'"),
         ("ppo", "contest_kl_weight", 2.0, "it needs reuse_batches 1"),
         ("ppo-dap", "awr_temperature", 0.3, "it needs lambda_awr above 0"),
+        ("ppo-dap", "std_after", 0.5, "it needs lambda_decay_steps"),
     ],
 )
 def test_options_without_effect_are_refused(method, option, value, why):
@@ -186,6 +187,7 @@ def test_options_without_effect_are_refused(method, option, value, why):
         ("ppo-gc", {"clip_slope": 0.3, "warm_start": "actor"}),
         ("ppo-awr", {"lambda_awr": 0.1, "awr_temperature": 0.3}),
         ("ppo-dap", {"lambda_awr": 0.1, "surrogate": "generalised_clip", "clip_slope": 0.05}),
+        ("ppo-dap", {"lambda_decay_steps": 1000, "std_after": 0.5}),
         ("ppo", {"warm_start": "none", "gamma": 0.9}),
         ("ppo-bc", {"warm_start": "actor"}),
         ("ppo-bc", {"warm_start": "actor_critic"}),

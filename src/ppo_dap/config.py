@@ -130,13 +130,14 @@ class ObjectiveConfig:
     lambda_aux: float = 1e-2
     """Weight of the imitation of proposals (Table 2)."""
     lambda_decay: float | None = None
-    """Fraction of the run at which all these weights have decayed linearly to 0, after which the run is PPO alone; None
-    keeps them constant."""
+    """Share of the run in which all these weights decay linearly to 0; then it is PPO alone. None keeps them."""
     lambda_decay_steps: int | None = None
     """Environment steps after which they are 0 at the latest, however long the run; None sets no limit."""
     std_floor: float = 0.0
     """KL and imitation leave the policy's standard deviations alone, in scaled actions, where they are at or below it;
     0 is Eq. 9, whose terms make a policy that seeks its own mode all but deterministic."""
+    std_after: float = 0.0
+    """Least standard deviation that the policy goes on with, times the share of their time that the limit cut off."""
     lambda_awr: float = 0.0
     """Weight of advantage-weighted imitation of the policy's own fresh actions (PPO + AWR/AWAC-aux)."""
     awr_temperature: float = 1.0
@@ -244,8 +245,8 @@ class Config:
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "tuned": {
-        "initial_std": None, "std_floor": 0.3, "lambda_kl": 3.0, "lambda_aux": 0.1, "lambda_decay": 0.5,
-        "lambda_decay_steps": 100_000, "kl_rule": "monitor", "mode_seeking": 1.0, "guidance_gate": True,
+        "lambda_kl": 3.0, "lambda_aux": 0.1, "mode_seeking": 1.0, "guidance_gate": True, "kl_rule": "monitor",
+        "lambda_decay": 0.5, "lambda_decay_steps": 100_000, "initial_std": None, "std_floor": 0.3, "std_after": 1.0,
     },
     "tuned-warm": {
         "lambda_kl": 0.2, "lambda_aux": 0.0, "lambda_decay": 0.5, "kl_rule": "monitor",
@@ -299,7 +300,8 @@ _RULES: dict[str, Rule] = {
     ),
     **dict.fromkeys(
         ("value_coefficient", "beta_max", "alpha_max", "lambda_kl", "lambda_aux", "lambda_awr", "pet_frequency",
-         "eval_every", "q_pessimism", "mode_seeking", "std_floor", "prior_return_weight", "contest_kl_weight"),
+         "eval_every", "q_pessimism", "mode_seeking", "std_floor", "std_after", "prior_return_weight",
+         "contest_kl_weight"),
         AT_LEAST_0,
     ),
     "seed": (lambda v: 0 <= v < 2**32, "a number from 0 to 4294967295"),

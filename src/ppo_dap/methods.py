@@ -149,6 +149,8 @@ def _require_effect(name: str, value: Any, method: Method, settings: Mapping[str
         raise InputError(f"{told}: it needs {needed[0]} {needed[1]!r}")
     if name.startswith("awr_") and not settings["lambda_awr"]:
         raise InputError(f"{told}: it needs lambda_awr above 0")
+    if name == "std_after" and value and settings["lambda_decay_steps"] is None:
+        raise InputError(f"{told}: it needs lambda_decay_steps")
 
 
 def capability_rows() -> list[dict[str, str]]:

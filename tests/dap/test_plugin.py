@@ -219,10 +219,10 @@ def test_it_takes_a_prior_by_its_file(prior, batch, tmp_path):
 def test_of_a_preset_it_has_all_but_what_needs_the_policy(prior, batch):
     guide = guide_of(prior, preset="tuned")
     tuned = make("tuned")
-    left_out = {"mode_seeking": 0.0, "guidance_gate": False, "std_floor": 0.0}
+    left_out = {"mode_seeking": 0.0, "guidance_gate": False, "std_floor": 0.0, "std_after": 0.0}
     of_preset, of_guide = flatten(tuned), flatten(guide.config)
     assert all(of_preset[name] != off == of_guide[name] for name, off in left_out.items())
-    assert guide.config.objective == replace(tuned, std_floor=0.0).objective
+    assert guide.config.objective == replace(tuned, std_floor=0.0, std_after=0.0).objective
     assert np.isfinite(guide(**batch).actions).all()
 
 

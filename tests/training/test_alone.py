@@ -10,7 +10,7 @@ import pytest
 from safetensors.numpy import load_file
 
 import ppo_dap
-from ppo_dap.dap.objective import weights_left
+from ppo_dap.dap.objective import regained_std, weights_left
 from ppo_dap.study.diagnostics.guided_run import load_guided
 from ppo_dap.training import run as run_module
 from ppo_dap.training import trainer
@@ -164,6 +164,57 @@ def test_a_limit_in_steps_ends_a_run_of_any_length(tmp_path, small):
         left = [True, *(row["env_steps"] < 256 for row in run.metrics[:-1])]
         assert ["awr_loss" in row for row in run.metrics] == left
         assert sum(left) < len(left)
+
+
+@pytest.mark.parametrize(
+    ("share", "limit", "steps", "cut_off"),
+    [
+        (0.5, 100_000, 1_000_000, 0.8),
+        (0.5, 100_000, 200_000, 0.0),
+        (0.5, 100_000, 100_000, 0.0),
+        (None, 250, 1000, 0.75),
+        (0.5, None, 1000, 0.0),
+    ],
+)
+def test_what_the_limit_cuts_off_the_spread_gets_back(share, limit, steps, cut_off):
+    settings = {"lambda_decay": share, "lambda_decay_steps": limit, "steps": steps}
+    assert regained_std(settings | {"std_after": 0.5}) == pytest.approx(0.5 * cut_off)
+    assert regained_std(settings | {"std_after": 0.0}) == 0
+
+
+@pytest.mark.parametrize("method", ["ppo-dap", "ppo-awr"])
+def test_the_spread_is_given_back_once_when_the_weights_end(tmp_path, hopper_prior, small, method):
+    """A quarter of the run has weights: three quarters of their time are cut off."""
+    prior = hopper_prior if method == "ppo-dap" else None
+    options = {**small, "steps": 1280, "progress": False, "lambda_decay_steps": 320}
+    plain = ppo_dap.train("Hopper-v5", method, prior=prior, out=tmp_path / "plain", **options)
+    wide = ppo_dap.train("Hopper-v5", method, prior=prior, out=tmp_path / "wide", std_after=2.0, **options)
+    last = next(n for n, row in enumerate(wide.metrics) if row["env_steps"] >= 320)
+    before, after = ([row["policy_std"] for row in run.metrics] for run in (plain, wide))
+    assert after[:last] == before[:last]
+    assert after[last] == pytest.approx(2.0 * 0.75, rel=1e-6)
+    assert before[last] < 1.2
+    assert 1.2 < after[last + 1] != after[last]  # and from there on it is PPO's
+    assert all(claim.holds for claim in wide.audit())
+    assert all(row["witnessed"] == 1 for row in wide.metrics)
+
+
+def test_a_spread_that_was_given_back_is_not_given_back_again(tmp_path, monkeypatch, small):
+    options = {**small, "steps": 1280, "progress": False, "lambda_decay_steps": 320, "std_after": 2.0}
+    whole = ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "whole", **options)
+    save, calls = trainer.save_checkpoint, []
+
+    def failing(path, *arguments):
+        calls.extend([path] if path.name == "last.safetensors" else [])
+        if len(calls) == 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(path, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "save_checkpoint", failing)
+        with pytest.raises(OSError, match="No space left"):
+            ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "cut", **options)
+    assert_same(ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "cut", resume=True, **options), whole)
 
 
 def test_imitation_of_its_own_actions_ends_as_well(tmp_path, small):

@@ -41,6 +41,18 @@ def weights_left(env_steps: int, flat: Mapping[str, Any]) -> float:
     return 1.0 if end is None else max(0.0, 1 - min(1.0, env_steps / steps) / end)
 
 
+def regained_std(flat: Mapping[str, Any]) -> float:
+    """Least standard deviation that the policy goes on with after the weights of Eq. 9; 0 leaves it what it is.
+
+    `std_after` times the share of the weights' time that `lambda_decay_steps` cut off: a run that is long beside what
+    it was guided for has to explore again, and one that was guided for all of `lambda_decay` has not.
+    """
+    limit = flat["lambda_decay_steps"]
+    if limit is None:
+        return 0.0
+    return flat["std_after"] * max(0.0, 1 - limit / ((flat["lambda_decay"] or 1.0) * flat["steps"]))
+
+
 class GatedProposals(eqx.Module):
     """Proposals with the gate that each has passed (1) or not (0)."""
 

@@ -36,7 +36,7 @@ from ppo_dap.priors import Prior, load_prior
 
 _WITHOUT_OUR_PPO = {
     "q_target": "td", "q_calibration": "none", "guidance_gate": False, "mode_seeking": 0.0, "std_floor": 0.0,
-    "warm_start": "none", "q_warm_start": False,
+    "std_after": 0.0, "warm_start": "none", "q_warm_start": False,
 }  # fmt: skip
 """What needs the advantages, the policy or the logs. A Guide is given none, and uses a preset that has it without."""
 
@@ -55,8 +55,8 @@ class Guide:
         `Config` by name.
 
         Q has a trunk of its own here, since this PPO's value network is not ours to read. What a preset has of the
-        policy is left out, since that is not ours either: `mode_seeking`, `guidance_gate`, `std_floor`, and
-        `initial_std`, for which `prior.spread()` has the number.
+        policy is left out, since that is not ours either: `mode_seeking`, `guidance_gate`, `std_floor`,
+        `std_after`, and `initial_std`, for which `prior.spread()` has the number.
         """
         if not isinstance(total_iterations, int) or total_iterations < 1:
             raise InputError(f"total_iterations must be a whole number above 0, not {total_iterations!r}")

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -19,8 +20,9 @@ from ppo_dap.dap import audit
 from ppo_dap.dap.adaptation import steps_until
 from ppo_dap.dap.guidance import beta_schedule
 from ppo_dap.dap.guide import recalibrated
-from ppo_dap.dap.objective import Weights, weights_left
+from ppo_dap.dap.objective import Weights, regained_std, weights_left
 from ppo_dap.errors import TrainingDiverged
+from ppo_dap.nets.arrays import on_device
 from ppo_dap.nets.policy import Policy
 from ppo_dap.ppo.rollout import Collector, Rollout
 from ppo_dap.ppo.update import Normaliser, Settings
@@ -79,12 +81,13 @@ class Trainer:
     _pending: Pending | None = field(default=None, init=False)
     _next_draws: tuple[int, Draws] | None = field(default=None, init=False)
     _recorded_steps: int = field(init=False)
+    _settings: dict[str, Any] = field(init=False)
     _last_return: float | None = field(default=None, init=False)
     _segment_start: int = field(default=0, init=False)
 
     def __post_init__(self):
         self.history = History(self.folder) if self.config.run.keep_history else None
-        self._recorded_steps = self.state.env_steps
+        self._recorded_steps, self._settings = self.state.env_steps, flatten(self.config)
         self._witness = Witness(self.state, self.spec, (self.config.run.seed, ROLLOUT_STREAM))
 
     def run(self) -> None:
@@ -153,6 +156,8 @@ class Trainer:
             valid = np.concatenate([part.valid for part in parts])
             state.observations = state.observations.update(np.concatenate([p.observations for p in parts])[valid])
             row: dict[str, Any] = {"env_steps": state.env_steps + int(valid.sum()), "iteration": state.iteration + 1}
+            if self.stages.adds and self._weights_left() and not weights_left(row["env_steps"], self._settings):
+                state.learner = _widened(state.learner, regained_std(self._settings))
             row["witnessed"] = self._witness.after(state, parts)
             row["return_train"] = float(np.mean(r)) if (r := collector.finished_returns) else None
             collector.finished_returns = []
@@ -173,7 +178,7 @@ class Trainer:
         self._pending = Pending(row, metrics, self.clock.turn(), time.perf_counter() - start)
 
     def _weights_left(self) -> float:
-        return weights_left(self.state.env_steps, flatten(self.config))
+        return weights_left(self.state.env_steps, self._settings)
 
     def _go_on_alone(self) -> None:
         """From here on the run is PPO: what has weight 0 for good need not be computed. A checkpoint keeps the guide.
@@ -310,6 +315,12 @@ class Trainer:
         """What was proved about the update; what is measured is in the metrics."""
         claims = [dataclasses.asdict(claim) for claim in self.static_claims]
         write_atomically(self.folder / "audit.json", json.dumps({"static": claims}, indent=1).encode())
+
+
+def _widened(learner: Learner, std: float) -> Learner:
+    """With a policy whose standard deviations are at least `std`."""
+    log_std = np.maximum(np.asarray(learner.ppo.actor.log_std), np.float32(np.log(std) if std > 0 else -np.inf))
+    return eqx.tree_at(lambda learner: learner.ppo.actor.log_std, learner, on_device(log_std))
 
 
 def _array(value: Any, dtype: Any = np.float32) -> Any:

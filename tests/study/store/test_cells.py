@@ -27,7 +27,7 @@ def test_names_are_what_they_were():
     assert LOGS.name == "185bf19310656537"
     assert PRIOR.name == "6893b57a90a9b0f7"
     assert cells.run("Hopper-v5", "ppo", seed=3).name == "1eea179fd99aec69"
-    assert cells.run("Hopper-v5", "ppo-dap", "tuned", prior=PRIOR).name == "8ddfec2992518184"
+    assert cells.run("Hopper-v5", "ppo-dap", "tuned", prior=PRIOR).name == "a0a2a903ce52c34e"
 
 
 def test_names_do_not_depend_on_the_process():
@@ -73,6 +73,9 @@ def test_a_limit_that_a_run_does_not_reach_is_not_in_its_name():
     assert name(steps=2000, lambda_decay_steps=1000, **half) == name(steps=2000, **half)
     assert name(steps=2001, lambda_decay_steps=1000, **half) != name(steps=2001, **half)
     assert name(steps=2000, lambda_decay_steps=1000) != name(steps=2000)  # nothing else ends the decay
+    limit = {"lambda_decay_steps": 1000, **half}
+    assert name(steps=2000, std_after=1.0, **limit) == name(steps=2000, **limit)
+    assert name(steps=2001, std_after=1.0, **limit) != name(steps=2001, **limit)
 
 
 def test_a_setting_that_is_not_in_the_name_is_found():

@@ -177,10 +177,10 @@ def run(
 
 
 def _unfelt(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """A limit that this run does not reach: it is made as without, and so has the name that it has without."""
+    """A limit that this run does not reach, and what would follow it: it is made and named as without."""
     share, limit = flat["lambda_decay"], flat["lambda_decay_steps"]
     unfelt = limit is not None and share is not None and share * flat["steps"] <= limit
-    return {"lambda_decay_steps": limit} if unfelt else {}
+    return {name: flat[name] for name in ("lambda_decay_steps", "std_after")} if unfelt else {}
 
 
 def reliability(of: Cell, states: int, rollouts: int, horizon: int | None = None, seed: int = 0) -> Cell:
