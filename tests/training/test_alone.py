@@ -1,5 +1,6 @@
 """A run whose weights have decayed goes on as plain PPO, with the bits that it would have had with its guide."""
 
+import contextlib
 import dataclasses
 import errno
 import json
@@ -36,6 +37,23 @@ def assert_same(run, other):
     assert tensors.keys() == expected.keys()
     assert all(tensors[name].tobytes() == expected[name].tobytes() for name in tensors)
     assert run.evaluations == other.evaluations
+
+
+@contextlib.contextmanager
+def checkpoint_lost(monkeypatch, number):
+    """The disk is full at the run's last checkpoint of that number, which ends it."""
+    save, calls = trainer.save_checkpoint, []
+
+    def failing(path, *arguments):
+        calls.extend([path] if path.name == "last.safetensors" else [])
+        if len(calls) == number:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(path, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "save_checkpoint", failing)
+        with pytest.raises(OSError, match="No space left"):
+            yield
 
 
 def test_what_it_learns_is_what_it_learns_with_an_idle_guide(tmp_path, monkeypatch, run, hopper_prior, small):
@@ -117,19 +135,9 @@ def test_the_last_checkpoint_of_the_guide_is_kept(run, hopper_prior):
 @pytest.mark.parametrize("lost", [3, 4])
 def test_it_resumes_from_before_and_from_after(tmp_path, monkeypatch, run, hopper_prior, small, lost):
     """The third checkpoint, which is lost, and so the second, from which the run goes on, are to either side."""
-    save, calls = trainer.save_checkpoint, []
-
-    def failing(path, *arguments):
-        calls.extend([path] if path.name == "last.safetensors" else [])
-        if len(calls) == lost:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        save(path, *arguments)
-
     out = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        patch.setattr(trainer, "save_checkpoint", failing)
-        with pytest.raises(OSError, match="No space left"):
-            ppo_dap.train("Hopper-v5", prior=hopper_prior, out=out, **OPTIONS, **small)
+    with checkpoint_lost(monkeypatch, lost):
+        ppo_dap.train("Hopper-v5", prior=hopper_prior, out=out, **OPTIONS, **small)
     assert any("guide" in name for name in load_file(out / "checkpoints" / "last.safetensors")) == (lost == 3)
     resumed = ppo_dap.train("Hopper-v5", prior=hopper_prior, out=out, resume=True, **OPTIONS, **small)
     assert_same(resumed, run)
@@ -202,18 +210,8 @@ def test_the_spread_is_given_back_once_when_the_weights_end(tmp_path, hopper_pri
 def test_a_spread_that_was_given_back_is_not_given_back_again(tmp_path, monkeypatch, small):
     options = {**small, "steps": 1280, "progress": False, "lambda_decay_steps": 320, "std_after": 2.0}
     whole = ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "whole", **options)
-    save, calls = trainer.save_checkpoint, []
-
-    def failing(path, *arguments):
-        calls.extend([path] if path.name == "last.safetensors" else [])
-        if len(calls) == 3:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        save(path, *arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(trainer, "save_checkpoint", failing)
-        with pytest.raises(OSError, match="No space left"):
-            ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "cut", **options)
+    with checkpoint_lost(monkeypatch, 3):
+        ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "cut", **options)
     assert_same(ppo_dap.train("Hopper-v5", "ppo-awr", out=tmp_path / "cut", resume=True, **options), whole)
 
 

@@ -156,8 +156,9 @@ class Trainer:
             valid = np.concatenate([part.valid for part in parts])
             state.observations = state.observations.update(np.concatenate([p.observations for p in parts])[valid])
             row: dict[str, Any] = {"env_steps": state.env_steps + int(valid.sum()), "iteration": state.iteration + 1}
-            if self.stages.adds and self._weights_left() and not weights_left(row["env_steps"], self._settings):
-                state.learner = _widened(state.learner, regained_std(self._settings))
+            std, ended = regained_std(self._settings), not weights_left(row["env_steps"], self._settings)
+            if std > 0 and self.stages.adds and ended and self._weights_left():
+                state.learner = _widened(state.learner, std)
             row["witnessed"] = self._witness.after(state, parts)
             row["return_train"] = float(np.mean(r)) if (r := collector.finished_returns) else None
             collector.finished_returns = []
@@ -319,7 +320,7 @@ class Trainer:
 
 def _widened(learner: Learner, std: float) -> Learner:
     """With a policy whose standard deviations are at least `std`."""
-    log_std = np.maximum(np.asarray(learner.ppo.actor.log_std), np.float32(np.log(std) if std > 0 else -np.inf))
+    log_std = np.maximum(np.asarray(learner.ppo.actor.log_std), np.float32(np.log(std)))
     return eqx.tree_at(lambda learner: learner.ppo.actor.log_std, learner, on_device(log_std))
 
 
