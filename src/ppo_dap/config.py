@@ -246,7 +246,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     "tuned": {
         "lambda_kl": 3.0, "lambda_aux": 0.1, "mode_seeking": 1.0, "guidance_gate": True, "kl_rule": "monitor",
-        "lambda_decay": 0.5, "lambda_decay_steps": 100_000, "initial_std": None, "std_floor": 0.3, "std_after": 1.0,
+        "lambda_decay": 0.5, "lambda_decay_steps": 100_000, "initial_std": None, "std_floor": 0.3, "std_after": 0.75,
     },
     "tuned-warm": {
         "lambda_kl": 0.2, "lambda_aux": 0.0, "lambda_decay": 0.5, "kl_rule": "monitor",
