@@ -126,12 +126,16 @@ def test_figure_10_has_differences_to_no_pet_of_the_same_preset(studies):
 
 def test_figures_7_and_9_tell_their_axes(studies):
     def numbers(labels):
-        return {"alc": 200.0 if labels["method"] == "ppo" else 300.0} if labels["seed"] == 0 else None
+        area = 200.0 if labels["method"] == "ppo" else 100.0 * labels.get("K", 3)
+        return {"alc": area} if labels["seed"] == 0 else None
 
     lines = body(TABLES["fig7"](made(studies["fig7"], numbers), studies["fig7"]))
     of = lines["Fig. 7: change over PPO", "ALC@40", "Walker2d-v5, medium-expert"]
     assert (of["the paper"], of["PPO-DAP"]) == ("+7.9%", "+50% (n=1)")
     assert sum(key[1] == "return after 1,000,000 steps" for key in lines) == 8
-    budgets = [key[2:] for key in body(TABLES["fig9"](made(studies["fig9"], numbers), studies["fig9"]))]
+    lines = body(TABLES["fig9"](made(studies["fig9"], numbers), studies["fig9"]))
+    of = lines["Fig. 9: proposal budget", "Hopper-v5, medium-expert", "K=20", "tuned"]
+    assert (of["ALC@40"], of["ALC@40: change over PPO"]) == ("2,000 (n=1)", "+900% (n=1)")
+    budgets = [key[2:] for key in lines]
     assert budgets[:4] == [("K=5", "paper"), ("K=5", "tuned"), ("K=10", "paper"), ("K=10", "tuned")]
     assert budgets[-1] == ("share=1", "tuned")
